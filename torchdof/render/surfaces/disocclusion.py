@@ -22,7 +22,7 @@ from ..layers.downsampling import downsampled
 from ..rules import active
 from .emitters import attribute_emitters
 from .frame import HIDDEN_WEIGHT, Surface
-from .matting import NEVER_PX, matte
+from .matting import NEVER_PX, Matted, matte
 
 # Another surface, or a slope of the pixel's own one; larger values of both: fewer hidden samples
 _BEHIND_PX = (
@@ -205,30 +205,9 @@ def _surfaces_of_image(
     mixed = other_weight * (2.0 / HIDDEN_WEIGHT) - 1.0
     counted = other_weight * mixed.clamp(0.0, 1.0)
 
-    colours = light.shape[1]
-    sizes = [[_continued(n, 2**own) for own in levels] for n in coc_px.shape[-2:]]
-    rows, columns = (max(of_items) for of_items in sizes)  # pixels of a level, centred on the image
-    maps = [own, coc_px, other, other_coc, other_weight, threshold, *([] if valid is None else [valid])]
-    pyramid = [_repeated(finest_level((rows // 2, columns // 2), *maps), sizes, 1)]
-    for level in range(2, max(levels) + 1):
-        pyramid.append(_repeated(coarser_level(pyramid[-1]), sizes, level))
-    # a pixel reads a level from a blur of a quarter of its step on
-    searched = [Level(t, 2**i, 2.0 ** (i - 2), _FALL**i / _SURE, _FALL**i) for i, t in enumerate(pyramid, 1)]
-
-    # the farthest surface around each cell of 4 x 4 pixels, and one level of cells that replaces all coarse levels
-    size = (rows // BEHIND_STEP, columns // BEHIND_STEP)
+    pyramid = _pyramid(matted, coc_px, threshold, valid, levels)
     wanted = ((coc_px.abs() > _HIDING_FROM_PX) & (mixed < 0)).to(coc_px.dtype)
-    coarse = searched[_FINE_LEVELS:]
-    looked = behind_cells(searched, size, coc_px, wanted, ops)
-    behind, _, votes, *of_coarse = looked.split([colours, 1, 1, *([colours + 2] if coarse else [])], 1)
-    # where nothing lies behind, the farthest surface of the cell; in a cell without valid pixels, the mean of all cells
-    far_light, _, far_weight = pyramid[_FINE_LEVELS - 1].split([colours, 1, 1], 1)
-    mean = (far_light * far_weight).sum((-2, -1), keepdim=True)
-    mean = mean / far_weight.sum((-2, -1), keepdim=True).clamp_min(1e-12)
-    behind = torch.where(votes > 0, behind, torch.where(far_weight > 0, far_light, mean))
-    if coarse:
-        of_cells = Level(of_coarse[0], BEHIND_STEP, coarse[0].least_px, 1.0, math.inf)
-        searched = [*searched[:_FINE_LEVELS], of_cells]
+    behind, searched = _light_behind(pyramid, coc_px, wanted, ops)
     seen, total = ops.seen(_seen, searched, coc_px, wanted)
 
     # Up to HIDDEN_WEIGHT / 2 a mixed sample does not count, and the hidden one replaces it. Both weights are 0 at the
@@ -236,13 +215,49 @@ def _surfaces_of_image(
     hidden = (total * (-HIDDEN_WEIGHT / _CERTAIN)).clamp_min(-HIDDEN_WEIGHT) * mixed.clamp(max=0.0)
     if not active().filling:
         hidden = torch.zeros_like(hidden)
-    is_hidden, (seen_light, seen_coc) = hidden > 0, seen.split([colours, 1], 1)
+    is_hidden, (seen_light, seen_coc) = hidden > 0, seen.split([light.shape[1], 1], 1)
     other = torch.where(is_hidden, seen_light, other)
     other_coc = torch.where(is_hidden, seen_coc, other_coc)
     own_weight, other_weight = 1.0 - counted, hidden + counted
     if valid is not None:
         own_weight, other_weight = own_weight * valid, other_weight * valid
     return own, own_weight, other, other_coc, other_weight, behind
+
+
+def _pyramid(
+    matted: Matted, coc_px: Tensor, threshold: Tensor, valid: Tensor | None, levels: Sequence[int]
+) -> list[Level]:
+    """Step 3 of :func:`surfaces_of_image`: the farthest surfaces of an image, fine to coarse, centred on it."""
+    own, other, other_coc, other_weight = matted
+    sizes = [[_continued(n, 2**level) for level in levels] for n in coc_px.shape[-2:]]
+    rows, columns = (max(of_items) // 2 for of_items in sizes)
+    maps = [own, coc_px, other, other_coc, other_weight, threshold, *([] if valid is None else [valid])]
+    pyramid = [_repeated(finest_level((rows, columns), *maps), sizes, 1)]
+    for level in range(2, max(levels) + 1):
+        pyramid.append(_repeated(coarser_level(pyramid[-1]), sizes, level))
+    # a pixel reads a level from a blur of a quarter of its step on
+    return [Level(t, 2**i, 2.0 ** (i - 2), _FALL**i / _SURE, _FALL**i) for i, t in enumerate(pyramid, 1)]
+
+
+def _light_behind(pyramid: Sequence[Level], coc_px: Tensor, wanted: Tensor, ops: Ops) -> tuple[Tensor, Sequence[Level]]:
+    """Step 4 of :func:`surfaces_of_image`: the light behind both surfaces, ``[B, C, h, w]``.
+
+    Also returns the levels that each pixel reads: the fine ones, and one of cells instead of all coarse ones.
+    ``wanted`` is 1 for pixels that may have a hidden surface, else 0.
+    """
+    coarse, of_cells = pyramid[_FINE_LEVELS:], pyramid[_FINE_LEVELS - 1].values
+    parts = [of_cells.shape[1] - 2, 1, 1]
+    looked = behind_cells(pyramid, (of_cells.shape[-2], of_cells.shape[-1]), coc_px, wanted, ops)
+    behind, _, votes, *of_coarse = looked.split([*parts, *([sum(parts)] if coarse else [])], 1)
+    # where nothing lies behind, the farthest surface of the cell; in a cell without valid pixels, the mean of all cells
+    far_light, _, far_weight = of_cells.split(parts, 1)
+    mean = (far_light * far_weight).sum((-2, -1), keepdim=True)
+    mean = mean / far_weight.sum((-2, -1), keepdim=True).clamp_min(1e-12)
+    behind = torch.where(votes > 0, behind, torch.where(far_weight > 0, far_light, mean))
+    if not coarse:
+        return behind, pyramid
+    cells = Level(of_coarse[0], BEHIND_STEP, coarse[0].least_px, 1.0, math.inf)
+    return behind, [*pyramid[:_FINE_LEVELS], cells]
 
 
 def _repeated(values: Tensor, sizes: Sequence[Sequence[int]], level: int) -> Tensor:
@@ -313,17 +328,17 @@ def _finest_level(
     around = [
         planes[2 * odd_row + odd_column][..., rows, columns] for odd_row, rows in parts for odd_column, columns in parts
     ]  # [B, C + 2, h, w] each; one tensor of all nine would take the memory of eleven images
-    coc, weight = (torch.cat([values[:, i, None] for values in around], 1) for i in (-2, -1))  # [B, 9, h, w]
+    colours = light.shape[1]
+    coc, weight = (torch.cat([t[:, i, None] for t in around], 1) for i in (colours, colours + 1))  # [B, 9, h, w]
     share = (shares[1][:, None, :, None] * shares[0][:, None, :]).flatten(0, 1)
     # on an axis of even size the last of three pixels has no share
     farthest = torch.where(share > 0, coc, -NEVER_PX).amax(1, keepdim=True)
     counts = weight * (1.0 - is_another_surface(farthest - coc)) * (share / 4.0)
     total = counts.sum(1, keepdim=True)
-    summed = around[0][:, :-1] * counts[:, :1]
+    summed = around[0][:, : colours + 1] * counts[:, :1]
     for k in range(1, 9):
-        summed = torch.addcmul(summed, around[k][:, :-1], counts[:, k, None])
-    mean = summed / total.clamp_min(_LEAST_TOTAL)
-    return torch.cat([mean[:, :-1], torch.where(total > 0, mean[:, -1:], -NEVER_PX), total], 1)
+        summed = torch.addcmul(summed, around[k][:, : colours + 1], counts[:, k, None])
+    return _level_of(summed, total)
 
 
 def coarser_level(values: Tensor) -> Tensor:
@@ -346,9 +361,13 @@ def _farthest(values: Tensor) -> Tensor:
     farthest = functional.interpolate(functional.max_pool2d(coc_px, 2), scale_factor=2.0, mode="nearest")
     counts = weight * (1.0 - is_another_surface(farthest - coc_px))
     means = downsampled(torch.cat([light * counts, coc_px * counts, counts], 1), 2)
-    total = means[:, -1:]
-    means = means[:, :-1] / total.clamp_min(_LEAST_TOTAL)
-    return torch.cat([means[:, :-1], torch.where(total > 0, means[:, -1:], -NEVER_PX), total], 1)
+    return _level_of(*means.split([light.shape[1] + 1, 1], 1))
+
+
+def _level_of(summed: Tensor, total: Tensor) -> Tensor:
+    """Light, coc and weight of a level, of the weighted sums of light and coc, ``[B, C + 1, h, w]``, and the weight."""
+    light, coc_px = (summed / total.clamp_min(_LEAST_TOTAL)).split([summed.shape[1] - 1, 1], 1)
+    return torch.cat([light, torch.where(total > 0, coc_px, -NEVER_PX), total], 1)
 
 
 def _seen(levels: Sequence[Level], coc_px: Tensor) -> Seen:
