@@ -1,8 +1,8 @@
 """Writes C++ headers of the constants that the Python modules define: ``constants.py FOLDER``.
 
 A constant has one definition, in the Python module whose comment gives its meaning and unit. C++ includes
-``constants/disocclusion.h`` and reads ``_FALL`` of ``render/disocclusion.py`` as ``constants::disocclusion::FALL``. The
-build runs this file, which reads the sources without importing them.
+``constants/disocclusion.h`` and reads ``_FALL`` of ``render/surfaces/disocclusion.py`` as
+``constants::disocclusion::FALL``. The build runs this file, which reads the sources without importing them.
 """
 
 import ast
@@ -19,9 +19,10 @@ PACKAGE = Path(__file__).parents[1] / "torchdof"
 MODULES = (
     "native/__init__",
     *(f"optics/{name}" for name in ("kernel_bank", "placed_kernels", "psf")),
-    *(f"render/{name}" for name in ("border", "composite", "convolution", "disocclusion", "downsampling", "edges")),
-    *(f"render/{name}" for name in ("exposure", "field", "highlights", "layer_cocs", "layer_weights", "matting")),
-    *(f"render/{name}" for name in ("pipeline", "plan", "surfaces")),
+    *(f"render/{name}" for name in ("exposure", "highlights", "pipeline")),
+    *(f"render/surfaces/{name}" for name in ("border", "disocclusion", "edges", "emitters", "frame", "matting")),
+    *(f"render/layers/{name}" for name in ("composite", "convolution", "downsampling", "field")),
+    *(f"render/layers/{name}" for name in ("layer_cocs", "layer_weights", "plan")),
 )
 """Modules whose constants C++ may read; a header and its namespace have the name of their module."""
 
@@ -34,7 +35,7 @@ _OPERATORS: dict[type[ast.AST], Any] = {
 
 
 def constants_of(module: str) -> dict[str, Value]:
-    """Numbers, and tuples of numbers, that a module such as ``render/plan`` assigns to names in capitals.
+    """Numbers, and tuples of numbers, that a module such as ``render/layers/plan`` assigns to names in capitals.
 
     Their expressions may have arithmetic, ``math`` and names of constants above them; others are left out.
     """

@@ -15,8 +15,8 @@ from torchdof.module import render
 from torchdof.optics.camera import Camera
 from torchdof.options import DepthEdges, Options
 from torchdof.render import routes
-from torchdof.render.ops import Ops
-from torchdof.render.plan import Plan
+from torchdof.render.engines.ops import Ops
+from torchdof.render.layers.plan import Plan
 
 from .operations import GraphOps, WholeOps
 

@@ -1,4 +1,4 @@
-"""The operations of exported graphs, in place of those of eager code (:mod:`torchdof.render.ops`).
+"""The operations of exported graphs, in place of those of eager code (:mod:`torchdof.render.engines.ops`).
 
 A graph cannot choose its work before it runs. In a loop over tiles each step reads a small window; branches skip layers
 without pixels in the window, and the whole tile if it is in focus.
@@ -13,10 +13,10 @@ from torch import Tensor
 from torchdof import pixels
 from torchdof.optics.blur_table import BlurTable
 from torchdof.pixels import Selected
-from torchdof.render.disocclusion import is_another_surface, search, shown_behind
-from torchdof.render.ops import Level, Ops, Seen
-from torchdof.render.plan import Plan
-from torchdof.render.surfaces import Highlights, PaddedFrame, PaddedSurface
+from torchdof.render.engines.ops import Level, Ops, Seen
+from torchdof.render.layers.plan import Plan
+from torchdof.render.surfaces.disocclusion import is_another_surface, search, shown_behind
+from torchdof.render.surfaces.frame import Highlights, PaddedFrame, PaddedSurface
 
 from .rays import kernels_of, splat
 from .structure import choose, collect, operator, steps

@@ -13,8 +13,8 @@ from torch import Tensor
 from torchdof import pixels
 from torchdof.optics.blur_table import BlurTable
 from torchdof.render.highlights import Occluders
-from torchdof.render.plan import Plan
-from torchdof.render.surfaces import Highlights
+from torchdof.render.layers.plan import Plan
+from torchdof.render.surfaces.frame import Highlights
 
 from .structure import carried, last, steps
 

@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, settings
 from tests import exported, on_cpu
 from torchdof import native
 from torchdof.kernels import layers
-from torchdof.render import on_gpu
+from torchdof.render.engines import on_gpu
 from torchdof.tensors import TRACEABLE
 
 settings.register_profile("local", deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -19,7 +19,7 @@ from torchdof.cli.main import app
 from torchdof.export import Verification, to_onnx
 from torchdof.export.graph import Layout, Portable
 from torchdof.export.verification import session
-from torchdof.render.plan import Plan
+from torchdof.render.layers.plan import Plan
 
 CAMERA = torchdof.Camera.from_fov(50.0, 0.05, 2.0)
 SMALL = torchdof.Camera(sensor_width_mm=4.0)  # 4 px at infinity in the hard cases' small frames

@@ -14,10 +14,10 @@ from torch import Tensor
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
 from torchdof.optics.aperture import Aperture
 from torchdof.optics.field import Field
-from torchdof.render.border import continued
 from torchdof.render.highlights import threshold
-from torchdof.render.layer_weights import from_blur_axis
-from torchdof.render.plan import Plan
+from torchdof.render.layers.layer_weights import from_blur_axis
+from torchdof.render.layers.plan import Plan
+from torchdof.render.surfaces.border import continued
 
 HEIGHT, WIDTH = 24, 32
 CAMERA = Camera(focal_length_mm=50.0, f_number=2.0, focus_m=2.0, sensor_width_mm=4.0)  # 4 px at infinity

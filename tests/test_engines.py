@@ -39,8 +39,8 @@ from torchdof.export.graph import Portable
 from torchdof.optics.aperture import Aperture
 from torchdof.reference.lens_views import lens_views
 from torchdof.reference.metrics import ssim
-from torchdof.render.edges import repair
-from torchdof.render.plan import Plan
+from torchdof.render.layers.plan import Plan
+from torchdof.render.surfaces.edges import repair
 
 BY_COLOUR = BlurTable("gaussian", [1.0], {"sigma": torch.tensor([[0.4], [0.5], [0.6]])}, name="by colour")
 

@@ -15,8 +15,8 @@ from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, tensors, vali
 from torchdof.depth import from_relative
 from torchdof.depth.relative import RELATIVE_KINDS
 from torchdof.io.highlights import expand_highlights
-from torchdof.render.layer_weights import from_blur_axis
-from torchdof.render.plan import Plan
+from torchdof.render.layers.layer_weights import from_blur_axis
+from torchdof.render.layers.plan import Plan
 
 gradcheck = functools.partial(torch.autograd.gradcheck, fast_mode=True)  # along a random direction of each input
 SUMS: dict[str, dict[str, Any]] = {**WAYS, "plain sum": {"occlusion": False, "normalize": False}}

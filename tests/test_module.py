@@ -19,7 +19,7 @@ from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, depth_of_fiel
 from torchdof.augmentation import RandomDepthOfField
 from torchdof.options import OptionArguments, Options
 from torchdof.reference import metrics
-from torchdof.render.plan import Plan
+from torchdof.render.layers.plan import Plan
 
 TYPES = [torch.float16, torch.bfloat16, torch.float32, torch.float64]
 TABLES = {

@@ -12,12 +12,13 @@ from .batch import flattened, leading_axes, numbers, restored
 from .optics.blur_table import BlurTable
 from .optics.camera import Camera
 from .options import OPTION_NAMES, OptionArguments, Options, from_config, spells_options, to_config
-from .render import edges, pipeline, routes
+from .render import pipeline, routes
 from .render.attention import Attention
-from .render.one_thread import on_one_thread
-from .render.ops import EAGER, Ops
-from .render.plan import Plan
-from .render.resample import at_size_of
+from .render.engines.one_thread import on_one_thread
+from .render.engines.ops import EAGER, Ops
+from .render.layers.plan import Plan
+from .render.surfaces import edges
+from .render.surfaces.resample import at_size_of
 from .tensors import is_traced, refuse_old_compiler, without_autocast
 
 __all__ = ["DepthOfField", "blur_by_coc", "depth_of_field"]

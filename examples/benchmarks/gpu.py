@@ -32,7 +32,7 @@ from examples.benchmarks.steps import Counted, crops
 from torchdof import blur_by_coc, native
 from torchdof.functional import splat
 from torchdof.kernels import layers, loader
-from torchdof.render import on_gpu
+from torchdof.render.engines import on_gpu
 
 HAS_DEVICE = torch.cuda.is_available()
 DEVICE = "cuda" if HAS_DEVICE else "cpu"

@@ -12,9 +12,11 @@ from torch import Tensor
 from tests.scenes import CAMERA, CASES, Case, assert_same_picture, post_before_lamps, random_scene
 from torchdof import BlurTable, DepthOfField, blur_by_coc
 from torchdof.kernels import layers
-from torchdof.render import composite, on_gpu, pipeline
-from torchdof.render.plan import Plan
-from torchdof.render.surfaces import PaddedFrame, maps_of, surfaces_of
+from torchdof.render import pipeline
+from torchdof.render.engines import on_gpu
+from torchdof.render.layers import composite
+from torchdof.render.layers.plan import Plan
+from torchdof.render.surfaces.frame import PaddedFrame, maps_of, surfaces_of
 from torchdof.tensors import TRACEABLE
 
 Padded = tuple[PaddedFrame, on_gpu.Kernels]

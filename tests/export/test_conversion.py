@@ -130,7 +130,7 @@ def test_onnxruntimes_optimised_copy_of_a_file_with_tiles_can_be_loaded(layered:
     np.testing.assert_allclose(copy.run(None, feed)[0], layered.runner.run(None, feed)[0], rtol=0, atol=1e-6)
 
 
-@pytest.mark.sweep  # a minute and a half; tests/render/test_coverage.py tries the same step without a file
+@pytest.mark.sweep  # a minute and a half; tests/render/surfaces/test_coverage.py tries the same step without a file
 def test_a_file_takes_a_matte_and_zeros_change_nothing(tmp_path: Path) -> None:
     """``to_onnx`` compares the file with the module on every case."""
     dof = torchdof.DepthOfField(CAMERA, max_coc_px=1.5, tolerance=64 / 255, depth_edges="as given")

@@ -14,8 +14,8 @@ from torchdof.export.verification import TOLERANCE, local_range, session
 from torchdof.options import DepthEdges
 from torchdof.reference.degraded import degrade
 from torchdof.reference.scenes import Plane, plane_scene, posts, waves
-from torchdof.render import edges
-from torchdof.render.plan import Plan
+from torchdof.render.layers.plan import Plan
+from torchdof.render.surfaces import edges
 
 KINDS = ("half-res", "near -1px", "exact")
 

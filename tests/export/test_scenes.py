@@ -13,7 +13,7 @@ from torchdof import BlurTable
 from torchdof.export import rays
 from torchdof.export.verification import TOLERANCE, local_range
 from torchdof.reference.scenes import read_scenes
-from torchdof.render.plan import Plan
+from torchdof.render.layers.plan import Plan
 
 DATA = Path(__file__).parents[1] / "data" / "scenes"
 SIZE = SIZES["fold"]

@@ -15,7 +15,7 @@ from torchdof import BlurTable
 from torchdof.export import chain, describe, to_onnx, verify
 from torchdof.export.graph import Portable
 from torchdof.export.verification import session
-from torchdof.render.plan import Plan
+from torchdof.render.layers.plan import Plan
 
 CONTROL = {"Loop", "If", "Scan", "NonZero", "SequenceMap"}
 FEW: dict[str, Any] = {"occlusion": False, "tolerance": "draft", "max_coc_px": 1.0, "check": False}

@@ -17,7 +17,7 @@ from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
 from torchdof.augmentation import RandomDepthOfField
 from torchdof.depth import depth_from_values, fill_holes
 from torchdof.io.images import Picture, write_image
-from torchdof.render.plan import Plan
+from torchdof.render.layers.plan import Plan
 
 pytestmark = pytest.mark.hard
 

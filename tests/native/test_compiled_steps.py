@@ -11,11 +11,11 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from torchdof import BlurTable, blur_by_coc, native
-from torchdof.render import disocclusion
-from torchdof.render.matting import matte
-from torchdof.render.ops import EAGER, Level
-from torchdof.render.plan import Plan
-from torchdof.render.surfaces import Surface, pad_to_frame
+from torchdof.render.engines.ops import EAGER, Level
+from torchdof.render.layers.plan import Plan
+from torchdof.render.surfaces import disocclusion
+from torchdof.render.surfaces.frame import Surface, pad_to_frame
+from torchdof.render.surfaces.matting import matte
 from torchdof.tensors import TRACEABLE
 
 pytestmark = pytest.mark.skipif(not native.chosen(), reason="the compiled engine is not built")

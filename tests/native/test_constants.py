@@ -79,7 +79,7 @@ def test_a_number_changed_in_python_reaches_the_header(tmp_path: Path) -> None:
         return {file.stem: file.read_text() for file in out.iterdir()}
 
     before = build()
-    changed = tmp_path / "torchdof" / "render" / "disocclusion.py"
+    changed = tmp_path / "torchdof" / "render" / "surfaces" / "disocclusion.py"
     changed.write_text(re.sub(r"\n_FALL = \S+", "\n_FALL = 0.25", changed.read_text()))
     after = build()
     assert written(after["disocclusion"]) == written(before["disocclusion"]) | {"FALL": 0.25}

@@ -58,7 +58,7 @@ import os, signal, sys, threading, time, torch
 signal.signal(signal.SIGINT, signal.default_int_handler)  # shells start background jobs with SIGINT ignored
 os.environ["TORCHDOF_ENGINE"] = "native"
 import torchdof
-from torchdof.render.plan import Plan
+from torchdof.render.layers.plan import Plan
 torch.set_num_threads(1)
 image, coc_px = torch.rand(1, 3, 3000, 4000), torch.linspace(-40.0, 40.0, 4000).expand(1, 1, 3000, 4000).contiguous()
 image[..., ::50, ::50] *= 1000.0

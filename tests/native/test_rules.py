@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchdof.render import composite, disocclusion, layer_weights, surfaces
+from torchdof.render.layers import composite, layer_weights
+from torchdof.render.surfaces import disocclusion, frame
 
 ROOT = Path(__file__).parents[2]
 COMPILER = os.environ.get("CXX") or shutil.which("c++")
@@ -27,12 +28,12 @@ RULES: dict[str, Callable[[Tensor], Tensor]] = {
     "ramp(x, true)": lambda x: layer_weights.eased(x.clamp(0.0, 1.0)),
     "ramp(v, true)[0]": lambda x: layer_weights.eased(x.clamp(0.0, 1.0)),
     "ramp(x, false)": lambda x: x.clamp(0.0, 1.0),
-    "continuation(v)[0]": surfaces.continuation_weight,
-    "visible_part(v)[0]": surfaces.visible_part,
-    "at_focus(v)[0]": surfaces.at_focus,
-    "stands_in(v)[0]": surfaces.stands_in,
-    "counts(v)[0]": surfaces.counts,
-    "seen(v)[0]": surfaces.seen,
+    "continuation(v)[0]": frame.continuation_weight,
+    "visible_part(v)[0]": frame.visible_part,
+    "at_focus(v)[0]": frame.at_focus,
+    "stands_in(v)[0]": frame.stands_in,
+    "counts(v)[0]": frame.counts,
+    "seen(v)[0]": frame.seen,
     "(v + raise(lacking(all(5e-4f), v)))[0]": lambda x: composite.raised(torch.full_like(x, 5e-4), x),
 }
 # C++ expression of a derivative -> the rule
@@ -113,13 +114,13 @@ def test_rules_at_points_computed_by_hand() -> None:
     assert disocclusion.is_another_surface(torch.tensor([0.5, 1.0, 1.5])).tolist() == [0.0, 0.5, 1.0]
     assert disocclusion.end_of_surface(torch.tensor([-8.0, -2.0, 2.0, 8.0])).tolist() == [-7.0, -2.0, 2.0, 9.0]
     assert disocclusion.is_read(torch.tensor([0.5, -0.75, 1.0]), 0.5).tolist() == [0.0, 0.5, 1.0]
-    assert surfaces.visible_part(torch.tensor([0.0, 0.03, 0.5])).tolist() == pytest.approx([1.0, 0.5, 0.0])
+    assert frame.visible_part(torch.tensor([0.0, 0.03, 0.5])).tolist() == pytest.approx([1.0, 0.5, 0.0])
     cover = torch.tensor([0.003, 0.053, 0.6])
-    assert surfaces.continuation_weight(cover).tolist() == pytest.approx([0.0, 0.4735, 0.4])
-    assert surfaces.at_focus(torch.tensor([-1.0, -0.1, 0.0, 5.0])).tolist() == pytest.approx([0.0, 0.75, 1.0, 1.0])
-    assert surfaces.stands_in(torch.tensor([-3.5, -2.25, -1.0, -0.0125, 1.0])).tolist() == pytest.approx(
+    assert frame.continuation_weight(cover).tolist() == pytest.approx([0.0, 0.4735, 0.4])
+    assert frame.at_focus(torch.tensor([-1.0, -0.1, 0.0, 5.0])).tolist() == pytest.approx([0.0, 0.75, 1.0, 1.0])
+    assert frame.stands_in(torch.tensor([-3.5, -2.25, -1.0, -0.0125, 1.0])).tolist() == pytest.approx(
         [0, 0.5, 1, 0.25, 0]
     )
-    assert surfaces.counts(torch.tensor([0.0, 0.0012, 0.003])).tolist() == pytest.approx([0.0, 0.5, 1.0])
+    assert frame.counts(torch.tensor([0.0, 0.0012, 0.003])).tolist() == pytest.approx([0.0, 0.5, 1.0])
     weights = torch.tensor([0.0, 0.001, 0.1])
     assert composite.raised(weights, weights).tolist() == pytest.approx([0.001, 0.001, 0.1])

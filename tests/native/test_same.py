@@ -11,8 +11,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.scenes import slope, whole
 from torchdof import Camera, blur_by_coc, native
-from torchdof.render.edges import mended
-from torchdof.render.plan import Plan
+from torchdof.render.layers.plan import Plan
+from torchdof.render.surfaces.edges import mended
 
 pytestmark = pytest.mark.skipif(not native.chosen(), reason="the compiled engine is not built")
 

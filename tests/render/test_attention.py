@@ -8,7 +8,7 @@ from tests.scenes import Scene
 from torchdof import Camera, DepthOfField
 from torchdof.reference.scenes import posts, waves
 from torchdof.render.attention import box_around, weight_map
-from torchdof.render.plan import Plan
+from torchdof.render.layers.plan import Plan
 from torchdof.validation import NAMED_TOLERANCES
 
 

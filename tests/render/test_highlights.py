@@ -11,8 +11,8 @@ from torch import Tensor
 from torchdof import BlurTable, blur_by_coc
 from torchdof.reference import metrics
 from torchdof.render import highlights
-from torchdof.render.plan import Plan
-from torchdof.render.surfaces import HIDDEN_WEIGHT, Surface
+from torchdof.render.layers.plan import Plan
+from torchdof.render.surfaces.frame import HIDDEN_WEIGHT, Surface
 
 LAMP = 3000.0
 
@@ -147,6 +147,12 @@ def test_fewer_highlights_are_rays_if_kernels_reach_farther() -> None:
     assert reach == pytest.approx([1.0, 2.5])
     disc, wide = (highlights.affordable_taps(coc, [each]) for each in reach)
     assert float(disc) == 16 * 32 * 32 and float(wide) == pytest.approx(float(disc) / 6.25)
+
+
+def test_fewer_highlights_are_rays_in_noisy_depth_where_each_meets_more_surfaces() -> None:
+    stripes = torch.arange(32) % 2 * torch.ones(1, 1, 32, 1)  # neighbours along one of both axes differ by 1 px
+    even, rough, rougher = (float(highlights.affordable_taps(change * stripes, [1.0])) for change in (0.0, 4.0, 8.0))
+    assert even == 16 * 32 * 32 and rough < even / 4 and rougher == pytest.approx(rough / 2)
 
 
 @pytest.mark.parametrize("range_of_light", [0.0, 1.0])

@@ -11,7 +11,7 @@ from torch import Tensor
 from examples.benchmarks.steps import Counted
 from tests.scenes import TABLES, assert_same_picture, random_scene
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
-from torchdof.render.plan import Plan
+from torchdof.render.layers.plan import Plan
 
 SIZE = (48, 64)
 RADII = (1.5, 30.0, 4.0, 0.0, 9.0)  # px: different layers, resolutions and pyramids; one item is in focus

@@ -29,7 +29,7 @@ from ..optics.aperture import Aperture
 from ..optics.blur_table import BlurTable
 from ..optics.camera import Camera
 from ..options import Options
-from ..render.resample import resampled
+from ..render.surfaces.resample import resampled
 from ..validation import one_channel, stretched, upright
 from .command import refuse
 from .lens import Area, Lens

@@ -1,7 +1,7 @@
 """Depth maps of any kind to metres along the optical axis: units, holes, files, reports, warnings, shots."""
 
-from ..render.edges import repair_edges
-from ..render.resample import at_size_of
+from ..render.surfaces.edges import repair_edges
+from ..render.surfaces.resample import at_size_of
 from .holes import fill_holes
 from .inspect import DepthReport, inspect_depth
 from .kinds import depth_from_values

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..optics.camera import Camera
-from ..render.edges import judged
+from ..render.surfaces.edges import judged
 from ..validation import image_and_map
 
 __all__ = ["EDGES", "DepthReport", "coc_colours", "depth_colours", "inspect_depth", "panels", "tint_focus"]

@@ -25,7 +25,7 @@ from ..io.atomic import atomic_file, write_text
 from ..io.images import Picture, read_image, write_image
 from ..io.transfer import Transfer
 from ..module import depth_of_field
-from ..render.resample import at_size_of
+from ..render.surfaces.resample import at_size_of
 from ..validation import choice, number, show, whole
 
 Format = Literal["webdataset", "parquet"]

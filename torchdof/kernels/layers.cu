@@ -1,4 +1,4 @@
-// The layers of torchdof.render.composite on a GPU, forward and backward. NVRTC compiles this file at first use, with the
+// The layers of torchdof.render.layers.composite on a GPU, forward and backward. NVRTC compiles this file at first use, with the
 // numbers CHANNELS, SURFACES, STACKED and LAYERS defined. There is no shared memory, no barrier and no atomic operation: one
 // thread writes each result and adds its terms in a fixed order. So the bits are the same each time, and in the tests a CPU
 // runs the threads one after the other.

@@ -31,7 +31,7 @@ Launch = Callable[[str, Sequence[int], Sequence[int], ctypes.Structure], None]
 
 
 class Frame(NamedTuple):
-    """A padded frame without its surfaces, as :class:`torchdof.render.surfaces.PaddedFrame`."""
+    """A padded frame without its surfaces, as :class:`torchdof.render.surfaces.frame.PaddedFrame`."""
 
     ramps: Tensor  # [1 or B, 2, n + 1]
     kernels: Sequence[Tensor]  # of n layers, near to far: [E, k, k] or [B, E, k, k]

@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 
-_CONSTANTS = ("composite", "disocclusion", "layer_weights", "surfaces")
+_CONSTANTS = ("composite", "disocclusion", "frame", "layer_weights")
 HEADERS = ("frame.h", "weights.h", "rules.h", "numbers.h", *(f"constants/{name}.h" for name in _CONSTANTS))
 """Files beside this one that kernels include; the build installs those that the compiled engine includes too."""
 

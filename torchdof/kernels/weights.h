@@ -19,7 +19,7 @@ __device__ inline float left_by(const float *values, int count, int without, int
 }
 
 #if STACKED
-// Surfaces that cover a pixel independently, near to far; the formula of _stacked in render/surfaces.py. Of surface j: its
+// Surfaces that cover a pixel independently, near to far; the formula of _stacked in render/surfaces/frame.py. Of surface j: its
 // share a at or behind the layer, and b behind it; h, the part of the light from behind that the surface hides in this layer and
 // those behind it; hidden, the part that its part in front of the layer hides; s, the part of the arriving light that stops in the layer.
 struct Stack {
@@ -67,7 +67,7 @@ __device__ inline void weigh_back(const Ramps &l, const Pixel &p, const Weights 
   }
 }
 #else
-// One surface, or two that share a pixel; the formula of _mixed in render/surfaces.py. Of surface j: its share a at or behind the
+// One surface, or two that share a pixel; the formula of _mixed in render/surfaces/frame.py. Of surface j: its share a at or behind the
 // layer, and b behind it; c, the weight that counts, w + continuation(w) visible_part(a of the nearer surface).
 struct Mixture {
   float a[SURFACES], b[SURFACES], c[SURFACES];
@@ -105,7 +105,7 @@ __device__ inline void weigh_back(const Ramps &l, const Pixel &p, const Weights 
 }
 #endif
 
-// Stand-ins for the background (PaddedFrame.stand_ins in render/surfaces.py): the cover of each surface of a pixel, its
+// Stand-ins for the background (PaddedFrame.stand_ins in render/surfaces/frame.py): the cover of each surface of a pixel, its
 // factors, and their sum. taken: how far a surface at the focus takes the place of a stand-in.
 struct StandIns {
   float seen_part[SURFACES], at_place[SURFACES], taken[SURFACES], alone[SURFACES], left[SURFACES], cover[SURFACES], sum;

@@ -251,7 +251,7 @@ def render(
 
 
 def blend(surfaces: Sequence[Surface], *frame: Any) -> Tensor:
-    """Blurs and composites the layers of a padded frame, as :func:`torchdof.render.composite.over`, for one image.
+    """Blurs and composites the layers of one padded frame, as :func:`torchdof.render.layers.composite.over`.
 
     Arguments are those of :func:`_layers_of`. The result ``[planes, height, width]`` is light, then coverage or
     transmittance of each colour of the kernels (or, without occlusion, the sum of weights).
@@ -308,7 +308,7 @@ def _field_masks(masks: Sequence[KernelMask]) -> list[Any] | None:
 
 
 def matte(light: Tensor, coc: Tensor, valid: Tensor | None = None) -> Tensor:
-    """Splits the mixed pixels of one image, as :func:`torchdof.render.matting.matte`.
+    """Splits the mixed pixels of one image, as :func:`torchdof.render.surfaces.matting.matte`.
 
     The result ``[2 C + 2, H, W]`` is own light, and light, coc and weight of the other surface.
     """
@@ -326,7 +326,7 @@ def matte_gradient(gradient: Tensor, light: Tensor, coc: Tensor, valid: Tensor |
 
 
 def farthest(maps: Sequence[Tensor], size: tuple[int, int]) -> Tensor:
-    """A level of a pyramid of the farthest surfaces, as ``torchdof.render.disocclusion`` defines it.
+    """A level of a pyramid of the farthest surfaces, as ``torchdof.render.surfaces.disocclusion`` defines it.
 
     ``maps`` are those of ``_finest_level`` there, for one image; or light, coc and weight of the next finer level.
     ``size`` is the level's height and width. The result is light, coc and weight, ``[C + 2, h, w]``.
@@ -348,7 +348,7 @@ def _of_surfaces(maps: Sequence[Tensor]) -> list[Tensor | None]:
 
 
 def look_behind(levels: Sequence[Tensor], rules: Rules, coc: Tensor, wanted: Tensor | None = None) -> Tensor:
-    """Surfaces behind those of an image with coc ``[1, H, W]``, as ``torchdof.render.disocclusion`` defines them.
+    """Surfaces behind those of an image with coc ``[1, H, W]``, as in ``torchdof.render.surfaces.disocclusion``.
 
     ``levels`` have light, coc and weight of each level of a pyramid, ``[C + 2, h, w]``, and ``rules`` its step,
     least_px, slope and most, as in ``torchdof_level``. The result is light, coc and votes, ``[C + 2, H, W]``. With a
@@ -377,7 +377,7 @@ def _level_arguments(levels: Sequence[Tensor], rules: Rules, coc: Tensor, wanted
 
 
 def continued(maps: Sequence[Tensor], ends: Sequence[int], *axis: Any) -> Tensor:
-    """S surfaces continued beyond the frame's border, as in :func:`torchdof.render.surfaces.pad_to_frame`.
+    """S surfaces continued beyond the frame's border, as in :func:`torchdof.render.surfaces.frame.pad_to_frame`.
 
     ``maps`` are light of each surface ``[C, H, W]``, then coc of each, weight of each, and the limit of highlights, all
     ``[1, H, W]``; ``axis`` holds the ends of the blur axis, and the index of the image's own surface or -1. The result
@@ -397,7 +397,7 @@ def continued_gradient(gradient: Tensor, maps: Sequence[Tensor], ends: Sequence[
 
 
 def repair_edges(light: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool = False) -> Tensor:
-    """Repairs the edges of a depth map, as :func:`torchdof.render.edges.repair`, for one image.
+    """Repairs the edges of a depth map, as :func:`torchdof.render.surfaces.edges.repair`, for one image.
 
     ``light`` is ``[C, H, W]``, ``nearness`` ``[H, W]``, ``step`` ``[H, W]`` or ``[]``. The result ``[H, W]`` is the
     input itself if it needs no repair.
@@ -422,7 +422,7 @@ def coc_px(depth: Tensor, scale: float, nearest_m: float, farthest_m: float) -> 
 
 
 def plan(coc_px: Tensor, tolerance: float) -> tuple[tuple[float, ...], float]:
-    """Positions of the layers for a frame ``[B, 1, H, W]``, and its tolerance, as ``torchdof.render.plan``."""
+    """Positions of the layers for a frame ``[B, 1, H, W]``, and its tolerance, as ``torchdof.render.layers.plan``."""
     count, capacity = ctypes.c_int32(0), 256
     while True:
         nodes, kept = _array(ctypes.c_double, capacity)(), ctypes.c_double(tolerance)

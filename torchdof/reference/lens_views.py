@@ -3,7 +3,7 @@
 Every point of the lens sees its own sharp picture. Each pixel of the image is a small square of a surface; a view
 shifts it by ``coc_px`` times the position on the lens. Nearer squares hide farther ones, and the views are averaged.
 Nothing is blurred, so nothing has to be composited. A pixel that shows two surfaces is split into both
-(:func:`torchdof.render.matting.matte`); areas hidden in the image have no weight.
+(:func:`torchdof.render.surfaces.matting.matte`); areas hidden in the image have no weight.
 
 References:
     Cook, Porter, Carpenter, "Distributed ray tracing", SIGGRAPH 1984.
@@ -15,7 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..render.matting import matte
+from ..render.surfaces.matting import matte
 from ..validation import scene, whole
 from .scenes import spread_points
 

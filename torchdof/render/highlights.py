@@ -25,11 +25,11 @@ from ..optics.blur_table import BlurTable
 from ..optics.kernel_bank import bank_of
 from ..optics.placed_kernels import FieldMask, placed_between, ray_masks
 from ..tensors import is_empty, is_traced, recomputed
-from .layer_cocs import mean_change
-from .ops import EAGER, Ops
-from .plan import KERNELS_PER_PX, kernels_for
+from .engines.ops import EAGER, Ops
+from .layers.layer_cocs import mean_change
+from .layers.plan import KERNELS_PER_PX, kernels_for
 from .rules import active
-from .surfaces import HIDDEN_WEIGHT, Highlights, Surface, continuation_weight
+from .surfaces.frame import HIDDEN_WEIGHT, Highlights, Surface, continuation_weight
 
 FACTOR = 8.0
 """A highlight is brighter than its surroundings by more than this factor."""
@@ -169,7 +169,8 @@ def affordable_taps(coc_px: Tensor, reach: Sequence[float]) -> Tensor:
 
     Each ray is tested against each possible occluder, and a noisy depth map has many. So the number is inversely
     proportional to the mean change of the coc between neighbours, above :data:`_FREE_CHANGE_PX`. Kernels reach
-    ``reach`` times as far as discs (:meth:`torchdof.render.plan.Plan.reach`), one number for all frames or for each.
+    ``reach`` times as far as discs (:meth:`torchdof.render.layers.plan.Plan.reach`), one number for all frames or for
+    each.
     """
     crowd = (mean_change(coc_px.detach()) / _FREE_CHANGE_PX).clamp_min(1.0)
     if not active().fewer_rays:

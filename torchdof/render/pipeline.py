@@ -1,6 +1,6 @@
 """Render one image: plan layers, split mixed pixels, fill hidden areas, extract highlights, blur layers, composite.
 
-Each step takes ``ops`` (:mod:`torchdof.render.ops`): one set of operations for eager code, another for exported graphs.
+Each step takes ``ops`` (:mod:`torchdof.render.engines.ops`): operations for eager code, or those for exported graphs.
 """
 
 import dataclasses
@@ -17,18 +17,21 @@ from .. import native
 from ..options import Options
 from ..tensors import is_differentiated, is_in_memory, is_traced
 from ..validation import NAMED_TOLERANCES
-from . import compiled, composite, edges, exposure, highlights, routes, rules
+from . import exposure, highlights, routes, rules
 from .attention import Attention, box_around, weight_map
-from .convolution import convolve
-from .coverage import covered_by
-from .disocclusion import behind_pixels, surfaces_of_image
-from .layer_weights import blur_axis
-from .matting import matte
-from .ops import EAGER, Ops
-from .plan import Plan, joined_layers
-from .scatter import fold
-from .surfaces import PaddedFrame, Surface, pad_to_frame
-from .traced import is_compiled
+from .engines import compiled
+from .engines.ops import EAGER, Ops
+from .engines.traced import is_compiled
+from .layers import composite
+from .layers.convolution import convolve
+from .layers.layer_weights import blur_axis
+from .layers.plan import Plan, joined_layers
+from .layers.scatter import fold
+from .surfaces import edges
+from .surfaces.coverage import covered_by
+from .surfaces.disocclusion import behind_pixels, surfaces_of_image
+from .surfaces.frame import PaddedFrame, Surface, pad_to_frame
+from .surfaces.matting import matte
 
 _REACH = 4.0  # margin around an attention area, in largest blur radii; less changes its light and hidden surfaces
 _TOGETHER = 2**21  # pixels of items rendered together; larger: fewer, larger operations, and more memory
@@ -236,8 +239,7 @@ def _image(
     5. Take the highlights out of the surfaces and splat them ray by ray.
     6. Blur and composite the layers, add the highlights, and undo step 2.
     """
-    plan = plans[0]
-    if len(plans) == 1 and plan.nodes == (0.0,):
+    if len(plans) == 1 and plans[0].nodes == (0.0,):
         # all in focus: the image is unchanged; with the term 0 * coc, the coc has a gradient of 0 instead of None
         return light + 0.0 * torch.nan_to_num(coc) if is_differentiated(coc) else light.clone()
     others = {"behind_light": behind_light, "behind_coc": behind_coc, "covered": covered}
@@ -251,52 +253,81 @@ def _image(
     ends = _reach(plans, coc)
     coc = coc.clamp(*ends)  # differences of huge values would round badly
     scale = exposure.scale_of(light, behind_light)
-    light, behind_light = light * scale, None if behind_light is None else behind_light * scale
+    light = light * scale
 
-    # Limit of highlights. Without occlusion, only highlights that a coarse layer would soften are splatted. A compiled
-    # graph has no rays, as their number depends on the light.
-    has_rays = plan.rays and ops.has_rays and rules.active().rays and not is_compiled()
-    crisp_px = [plan.crisp_px if options.method == "layered" else math.inf for plan in plans]
-    widest = [max(map(abs, plan.coc_px)) for plan in plans]
-    coarse = has_rays and any(crisp < most for crisp, most in zip(crisp_px, widest, strict=True))
-    limit = highlights.threshold(light, weight) if options.occlusion or options.normalize or coarse else None
-    # One layer needs no rays: its kernel is exact, unless blocks of pixels share kernels that change across the frame.
-    several = len(plan.nodes) > 1 or options.table.depends_on_place
-    splatted = several and (options.occlusion or coarse)
+    splatted_px = _splatted_px(plans, options, ops)
+    has_limit = options.occlusion or options.normalize or splatted_px is not None
+    limit = highlights.threshold(light, weight) if has_limit else None
 
     # surfaces of each pixel, and the light behind all of them
-    surfaces, behind = [Surface(light, coc, weight)], None
-    if behind_light is not None and behind_coc is not None and limit is not None:
-        surfaces = _before_background(surfaces[0], behind_light, behind_coc, ends, options, covered)
-    elif options.occlusion and limit is not None and splatted:
+    surfaces, own, behind = [Surface(light, coc, weight)], 0, None
+    if behind_light is not None and behind_coc is not None:
+        surfaces, own = _before_background(surfaces[0], behind_light * scale, behind_coc, ends, options, covered), 1
+    elif options.occlusion and limit is not None and _has_several_kernels(plans, options):
+        widest = [max(map(abs, plan.coc_px)) for plan in plans]
         levels = [min(math.ceil(math.log2(max(2.0, most))) + 1, native.MOST_LEVELS) for most in widest]
         surfaces, behind = surfaces_of_image(light, coc, weight, limit, levels, ops, covered)
         behind = behind if rules.active().light_behind else None
 
-    # highlights of these surfaces, ray by ray
     splats = None
-    if limit is not None and splatted and has_rays:
-        (from_px,) = [0.0] if options.occlusion else _of_plans([(px - 1.0,) for px in crisp_px], coc)
-        # with a known background, mixed pixels need no second surface for their highlights
-        beside = [(s, coc) for s in surfaces[::-1]] if len(surfaces) == 2 else [None] * len(surfaces)
-        reach = [plan.reach(options.table, ops.lens_width or coc.shape[-1]) for plan in plans]
-        most_taps = highlights.affordable_taps(coc, reach) if options.occlusion else None
-        extracted = [
-            highlights.extract(s, limit, from_px, b, most_taps, ops) for s, b in zip(surfaces, beside, strict=True)
-        ]
-        surfaces, rays = [s for s, _ in extracted], [r for _, r in extracted if r is not None]
-        # surfaces that can block rays, the image's own first; a known background is the farthest and blocks none
-        shown = surfaces if behind_light is None else surfaces[1::-1]
-        stops = options.occlusion and rules.active().occluders
-        if rays:
-            splats = highlights.splat(rays, shown, options.table, stops, plan.kernels_per_px, ops)
+    if limit is not None and splatted_px is not None:
+        surfaces, splats = _splat_highlights(surfaces, own, limit, splatted_px, plans, options, ops)
 
-    # blur and composite the layers, far to near
-    own = 0 if behind_light is None else 1
-    out = _composite(surfaces, behind, plans, options, ops, own, limit, splats)
-    out = out / scale
+    out = _composite(surfaces, behind, plans, options, ops, own, limit, splats) / scale
     out = out if valid is None else torch.where(valid, out, image)
     return ops.equal_unless(lambda: blur_axis(coc).abs().max() > 0, out, image)
+
+
+def _has_several_kernels(plans: Sequence[Plan], options: Options) -> bool:
+    """Whether there are several layers, or kernels that change across the frame; else the only kernel is exact."""
+    return len(plans[0].nodes) > 1 or options.table.depends_on_place
+
+
+def _splatted_px(plans: Sequence[Plan], options: Options, ops: Ops) -> list[float] | None:
+    """Blur in pixels from which highlights are splatted ray by ray, of all items or of each plan; None: none are.
+
+    With occlusion all are; without, only those that a coarse layer would soften. A compiled graph has no rays, as their
+    number depends on the light.
+    """
+    has_rays = plans[0].rays and ops.has_rays and rules.active().rays and not is_compiled()
+    if not has_rays or not _has_several_kernels(plans, options):
+        return None
+    if options.occlusion:
+        return [0.0]
+    crisp_px = [plan.crisp_px if options.method == "layered" else math.inf for plan in plans]
+    is_coarse = any(crisp < max(map(abs, plan.coc_px)) for crisp, plan in zip(crisp_px, plans, strict=True))
+    return [crisp - 1.0 for crisp in crisp_px] if is_coarse else None
+
+
+def _splat_highlights(
+    surfaces: list[Surface],
+    own: int,
+    limit: Tensor,
+    splatted_px: Sequence[float],
+    plans: Sequence[Plan],
+    options: Options,
+    ops: Ops,
+) -> tuple[list[Surface], Tensor | None]:
+    """Takes the highlights out of surfaces and splats them: the surfaces without them, and the light of the rays.
+
+    ``own`` is the index of the image's own surface: 1 if there is a known background, which comes last.
+    """
+    coc = surfaces[own].coc_px
+    (from_px,) = _of_plans([(px,) for px in splatted_px], coc)
+    # with a known background, mixed pixels need no second surface for their highlights
+    beside = [(s, coc) for s in surfaces[::-1]] if len(surfaces) == 2 else [None] * len(surfaces)
+    reach = [plan.reach(options.table, ops.lens_width or coc.shape[-1]) for plan in plans]
+    most_taps = highlights.affordable_taps(coc, reach) if options.occlusion else None
+    extracted = [
+        highlights.extract(s, limit, from_px, b, most_taps, ops) for s, b in zip(surfaces, beside, strict=True)
+    ]
+    surfaces, rays = [s for s, _ in extracted], [r for _, r in extracted if r is not None]
+    if not rays:
+        return surfaces, None
+    # surfaces that can block rays, the image's own first; a known background is the farthest and blocks none
+    shown = surfaces[1::-1] if own else surfaces
+    stops = options.occlusion and rules.active().occluders
+    return surfaces, highlights.splat(rays, shown, options.table, stops, plans[0].kernels_per_px, ops)
 
 
 def _reach(plans: Sequence[Plan], like: Tensor) -> Sequence[Any]:

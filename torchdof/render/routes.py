@@ -18,7 +18,7 @@
 - compiled: the compiled engine renders the whole picture. What a matte says is computed in PyTorch before.
 - steps: PyTorch renders, and the compiled engine computes those of its steps that it supports.
 - kernels: PyTorch renders, and CUDA kernels blur and composite the layers of float32, with and without gradients, of up
-  to 8 channels, or of any number of colours with kernels of their own (:mod:`torchdof.render.on_gpu`).
+  to 8 channels, or of any number of colours with kernels of their own (:mod:`torchdof.render.engines.on_gpu`).
 - otherwise: float64, or another device.
 - PyTorch: PyTorch renders alone. So it does where there is no compiled engine, or no NVRTC beside PyTorch for the
   kernels; with `TORCHDOF_ENGINE=torch`; and in forward mode or under `torch.func`.
@@ -41,8 +41,8 @@ from ..kernels import layers
 from ..options import Options
 from ..tensors import is_differentiated, is_traced
 from ..validation import engine_reads
-from . import on_gpu
-from .plan import KERNELS_PER_PX, Plan
+from .engines import on_gpu
+from .layers.plan import KERNELS_PER_PX, Plan
 
 Call = Literal["image", "stack", "splat", "file", "whole file"]
 """The kind of call: the rendering of an image or of a stack of layers, ``splat``, or the export in tiles or whole."""
@@ -192,7 +192,7 @@ def _of_eager(
 
 
 def _of_gpu(options: Options, maps: Sequence[Tensor], is_stack: bool) -> Route:
-    """As :func:`route`, for a device with kernels, by the conditions of :func:`torchdof.render.on_gpu.composited`."""
+    """As :func:`route`, for a device with kernels, as :func:`torchdof.render.engines.on_gpu.composited` decides."""
     channels = 1 if options.table.channels > 1 else maps[0].shape[-3]
     # a stack has a black surface behind it; a known background is behind the two surfaces of a pixel
     surfaces = maps[0].shape[1] + 1 if is_stack else 3 if len(maps) > 2 else 2

@@ -43,7 +43,7 @@ typedef struct {
   const float *const *light;   // for each surface [channels, height, width]
   const float *const *coc;     // for each surface [height, width]: signed radius in pixels, negative in front of the focus
   const float *const *weight;  // for each surface [height, width], or null: it covers its pixels fully
-  const float *covered;        // second surfaces that a matte gives [channels + 3, height, width], or null; see render/coverage.py
+  const float *covered;        // second surfaces that a matte gives [channels + 3, height, width], or null; see render/surfaces/coverage.py
   int32_t occlusion;           // 0: light of all surfaces is added, without occlusion
   int32_t normalize;           // 0: without occlusion, do not divide by the blurred weight
   int32_t masked;  // 1: inputs may be NaN or infinite (not in a stack); such pixels are copied and do not affect others
@@ -157,7 +157,7 @@ typedef struct {
 TORCHDOF_API int32_t torchdof_blend(const torchdof_layers *layers, float *out, const float *gradient, float *const *of_light,
                                     float *const *of_place, float *const *of_weight);
 
-// A level of the pyramid from which hidden surfaces are filled; see render/disocclusion.py.
+// A level of the pyramid from which hidden surfaces are filled; see render/surfaces/disocclusion.py.
 typedef struct {
   const float *values;    // [channels + 2, rows, columns]: light, coc, weight
   int32_t rows, columns;  // at least 2
@@ -166,7 +166,7 @@ typedef struct {
   float slope, most;      // votes for each weight of the samples, and largest number of votes
 } torchdof_level;
 
-// Splits the mixed pixels of an image; see render/matting.py. maps: light [channels, height, width], coc [height, width], and 0
+// Splits the mixed pixels of an image; see render/surfaces/matting.py. maps: light [channels, height, width], coc [height, width], and 0
 // for pixels that are left out [height, width] or null. out: own and other light, coc and weight of the other surface,
 // [2 channels + 2, height, width]. The first two maps have gradients.
 TORCHDOF_API int32_t torchdof_matte(const float *const *maps, int32_t channels, int32_t height, int32_t width, int32_t threads,
@@ -190,7 +190,7 @@ TORCHDOF_API int32_t torchdof_look_behind(const torchdof_level *levels, int32_t 
                                           float *const *of_levels, float *of_coc);
 
 // Surfaces continued beyond the frame's border: light, position on the blur axis and weight of each [surfaces, channels + 2,
-// height + ends, width + ends]; see render/border.py. maps: light of each surface [channels, height, width], coc of each, weight
+// height + ends, width + ends]; see render/surfaces/border.py. maps: light of each surface [channels, height, width], coc of each, weight
 // of each, and light above which a pixel is a highlight, [height, width]. ends: pixels added at the left, right, top and bottom.
 // low, high: ends of the blur axis. image: the image's own surface, or -1: each one is an image. All maps but the last have
 // gradients.

@@ -6,7 +6,7 @@
 //   l = K * (m I),  w = K * m,  v = K * r,   n = w + v' (v' is v, raised where w + v < KNOWN)
 //   picture = l / n + (1 - w / n) picture
 //
-// Between the focus and the layers before it, surfaces stand in for the background (stand_ins in render/surfaces.py).
+// Between the focus and the layers before it, surfaces stand in for the background (stand_ins in render/surfaces/frame.py).
 //
 // Backward, the blurred l, w and v are computed again and kept, block by block; their gradients replace them. Each block
 // then composites its layers again, walks back through them from near to far, and the gradients of l, w and v are

@@ -1,4 +1,4 @@
-// Estimates the light beyond the frame's border, as described in render/border.py.
+// Estimates the light beyond the frame's border, as described in render/surfaces/border.py.
 #include "engine.h"
 
 namespace torchdof {

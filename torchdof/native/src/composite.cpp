@@ -1,4 +1,4 @@
-// Composites the layers from far to near, as described in render/composite.py. With m a layer's share of each pixel and
+// Composites the layers from far to near, as described in render/layers/composite.py. With m a layer's share of each pixel and
 // M the share at or behind the layer (its normalizer), K its kernel and I its light:
 //
 //   colour = K * (m I) / K * M,   coverage = K * m / K * M,   picture = colour + (1 - coverage) picture

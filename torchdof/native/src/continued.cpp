@@ -1,5 +1,5 @@
 // Surfaces continued beyond the frame's border, forward and backward, for training: the function _continued of
-// render/border.py. Inference computes only the parts that it needs, in border.cpp.
+// render/surfaces/border.py. Inference computes only the parts that it needs, in border.cpp.
 //
 // For a pixel i of a line along the border with light I and weight w, and the pixels j within 4 d pixels of it:
 //

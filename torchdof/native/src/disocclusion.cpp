@@ -1,5 +1,5 @@
 // Disocclusion: fills the surfaces hidden behind a blurred foreground with light and depth of the farthest surfaces
-// around, as described in render/disocclusion.py.
+// around, as described in render/surfaces/disocclusion.py.
 #include "engine.h"
 #include "rules.h"
 

@@ -240,7 +240,7 @@ struct Layer {
   std::vector<Kernel> kernels;  // 1, or one for each colour
 };
 
-// The blur axis of render/layer_weights.py: the position of a signed coc, clamped to [low, high], and its inverse.
+// The blur axis of render/layers/layer_weights.py: the position of a signed coc, clamped to [low, high], and its inverse.
 constexpr double SQUARE_PX = constants::layer_weights::SQUARE_PX;
 constexpr double IN_FOCUS = constants::layer_weights::IN_FOCUS;
 template <typename V>

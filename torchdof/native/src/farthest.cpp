@@ -1,5 +1,5 @@
 // A level of the pyramid from which hidden surfaces are filled, forward and backward, for training: the functions
-// _finest_level and _farthest of render/disocclusion.py. Inference computes them in disocclusion.cpp.
+// _finest_level and _farthest of render/surfaces/disocclusion.py. Inference computes them in disocclusion.cpp.
 //
 // A pixel shows its farther surface: the other one if it is mixed in and lies behind, else its own, with highlights dimmed
 // to their threshold. For a sample and the pixels j around it with light I, coc d, weight w and share s of the sample:

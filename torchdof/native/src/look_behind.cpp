@@ -1,5 +1,5 @@
 // The surfaces behind each pixel, read from the levels of a pyramid, forward and backward: the functions shown_behind and
-// search of render/disocclusion.py, for training. Inference fills hidden surfaces in disocclusion.cpp.
+// search of render/surfaces/disocclusion.py, for training. Inference fills hidden surfaces in disocclusion.cpp.
 //
 // For a pixel with coc c, and the four samples j of level l around it with coc d, weight w and bilinear weight s:
 //
@@ -23,7 +23,7 @@ constexpr float LEAST_TOTAL = constants::disocclusion::LEAST_TOTAL;
 constexpr int BAND = 32;  // least rows of places whose gradients one thread adds up
 
 // Places of an axis, pixels or cells, `step` pixels apart and centred on an image; and the pixels of each place, as _window
-// of render/disocclusion.py: on an axis of even size a cell's last pixel repeats the one before.
+// of render/surfaces/disocclusion.py: on an axis of even size a cell's last pixel repeats the one before.
 struct Axis {
   const int step, count, taps;
   std::vector<int> pixels;  // [count, taps]

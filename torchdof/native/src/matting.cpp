@@ -1,5 +1,6 @@
 // Matting: a pixel at a depth edge mixes the light of two surfaces but has the depth of one. Splits it into both, as
-// described in render/matting.py.
+// described in render/surfaces/matting.py and render/surfaces/emitters.py.
+#include "constants/emitters.h"
 #include "constants/matting.h"
 #include "constants/pipeline.h"
 #include "engine.h"
@@ -7,7 +8,7 @@
 namespace torchdof {
 namespace {
 
-// Constants of render/matting.py and render/pipeline.py, which give their meanings, units and effects.
+// Constants of matting.py, emitters.py and pipeline.py in render, which give their meanings, units and effects.
 constexpr float EDGE_PX = constants::matting::EDGE_PX;
 constexpr float UNCLEAN = constants::matting::UNCLEAN;
 constexpr float TRUST = constants::matting::TRUST;
@@ -15,10 +16,10 @@ constexpr float TEXTURE = constants::matting::TEXTURE;
 constexpr float MOST_CLEAN = constants::matting::MOST_CLEAN;
 constexpr float ALIKE = constants::matting::ALIKE;
 constexpr float UNBOUNDED = constants::matting::UNBOUNDED;
-constexpr float DIM = constants::matting::DIM;
-constexpr float MOST_WEIGHT = constants::matting::MOST_WEIGHT;
-constexpr int EMITTER_REACH = constants::matting::EMITTER_REACH;
-constexpr int TOUCHING = constants::matting::TOUCHING;
+constexpr float DIM = constants::emitters::DIM;
+constexpr float MOST_WEIGHT = constants::emitters::MOST_WEIGHT;
+constexpr int EMITTER_REACH = constants::emitters::EMITTER_REACH;
+constexpr int TOUCHING = constants::emitters::TOUCHING;
 constexpr float SAME_PX = constants::pipeline::SAME_PX;
 enum Side { IN_FRONT = -1, BEHIND = 1 };  // of an emitter, relative to a surface
 
@@ -733,7 +734,7 @@ void set_weight(const Surfaces &s, const Block &block, size_t at, int within, fl
   block.own_weight[within] = 1.0f - weight;
 }
 
-// Gives pixels of a block the second surfaces of a matte, by their certainty; see render/coverage.py.
+// Gives pixels of a block the second surfaces of a matte, by their certainty; see render/surfaces/coverage.py.
 void cover_block(Job &job, int by, int bx) {
   Surfaces &s = job.surfaces;
   const size_t area = s.area();

@@ -3,8 +3,8 @@
 #pragma once
 #include "constants/composite.h"
 #include "constants/disocclusion.h"
+#include "constants/frame.h"
 #include "constants/layer_weights.h"
-#include "constants/surfaces.h"
 
 namespace torchdof {
 
@@ -31,14 +31,14 @@ constexpr float KNOWN = constants::composite::KNOWN;
 constexpr float BEHIND_PX = constants::disocclusion::BEHIND_PX;
 constexpr float OWN_SLOPE = constants::disocclusion::OWN_SLOPE;
 constexpr float FOOT = constants::layer_weights::FOOT;
-constexpr float HIDDEN_WEIGHT = constants::surfaces::HIDDEN_WEIGHT;
-constexpr float HIDING_SHARE = constants::surfaces::HIDING_SHARE;
-constexpr float LEAST_PASSING = constants::surfaces::LEAST_PASSING;
-constexpr float CONTINUES_FROM = constants::surfaces::CONTINUES_FROM;
-constexpr float AT_FOCUS = constants::surfaces::AT_FOCUS;
-constexpr float OFF_FOCUS = constants::surfaces::OFF_FOCUS;
-constexpr float BARELY_BLURRED = constants::surfaces::BARELY_BLURRED;
-constexpr float COUNTED = constants::surfaces::COUNTED;
-constexpr float SEEN_FROM = constants::surfaces::SEEN_FROM;
+constexpr float HIDDEN_WEIGHT = constants::frame::HIDDEN_WEIGHT;
+constexpr float HIDING_SHARE = constants::frame::HIDING_SHARE;
+constexpr float LEAST_PASSING = constants::frame::LEAST_PASSING;
+constexpr float CONTINUES_FROM = constants::frame::CONTINUES_FROM;
+constexpr float AT_FOCUS = constants::frame::AT_FOCUS;
+constexpr float OFF_FOCUS = constants::frame::OFF_FOCUS;
+constexpr float BARELY_BLURRED = constants::frame::BARELY_BLURRED;
+constexpr float COUNTED = constants::frame::COUNTED;
+constexpr float SEEN_FROM = constants::frame::SEEN_FROM;
 
 }  // namespace torchdof

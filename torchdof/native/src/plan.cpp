@@ -1,5 +1,5 @@
 // Circles of confusion of a frame, and the positions of its layers on the blur axis; formulas in optics/camera.py,
-// render/layer_cocs.py and render/plan.py.
+// render/layers/layer_cocs.py and render/layers/plan.py.
 #include "engine.h"
 
 #include <numeric>

@@ -14,7 +14,7 @@ inline auto within(V v) {
 }
 
 // Largest coc of a pixel's own surface nearby, which may slope: c + max(OWN_SLOPE |c| - BEHIND_PX, 0); and its derivative.
-// render/disocclusion.py, end_of_surface.
+// render/surfaces/disocclusion.py, end_of_surface.
 template <typename V>
 inline V end_of_surface(V coc) {
   return coc + most(most(coc, -coc) * OWN_SLOPE - BEHIND_PX, V{});
@@ -24,7 +24,7 @@ inline float slope_of_end(float coc) {
 }
 
 // Confidence that a surface whose coc is larger by d is another surface: clamp(d - BEHIND_PX + 1/2, 0, 1).
-// render/disocclusion.py, is_another_surface.
+// render/surfaces/disocclusion.py, is_another_surface.
 template <typename V>
 inline V unlimited_another_surface(V distance_px) {
   return distance_px - (BEHIND_PX - 0.5f);
@@ -34,7 +34,7 @@ inline V is_another_surface(V distance_px) {
   return clamp01(unlimited_another_surface(distance_px));
 }
 
-// How much a pixel reads a level of the pyramid: clamp(|c| / least_px - 1, 0, 1). render/disocclusion.py, is_read.
+// How much a pixel reads a level of the pyramid: clamp(|c| / least_px - 1, 0, 1). render/surfaces/disocclusion.py, is_read.
 template <typename V>
 inline V unlimited_read(V size_px, float least_px) {
   return size_px * (1.0f / least_px) - 1.0f;  // least_px is a power of two: no rounding
@@ -44,7 +44,7 @@ inline V is_read(V size_px, float least_px) {
   return clamp01(unlimited_read(size_px, least_px));
 }
 
-// A ramp from 0 to 1 with a parabola as its foot, up to FOOT; exact at both ends. render/layer_weights.py, eased.
+// A ramp from 0 to 1 with a parabola as its foot, up to FOOT; exact at both ends. render/layers/layer_weights.py, eased.
 constexpr float SLOPE = 1 / (1 - FOOT / 2);  // of the straight part
 template <typename V>
 inline V eased(V v) {
@@ -64,7 +64,7 @@ inline V slope_of_ramp(V v, bool ease) {
 }
 
 // Share of a surface at `place` that belongs to a layer or to layers behind it; below, the share that belongs to layers
-// behind it. Both are ramps, eased under occlusion. render/layer_weights.py, weights_at_or_behind.
+// behind it. Both are ramps, eased under occlusion. render/layers/layer_weights.py, weights_at_or_behind.
 template <typename L, typename V>
 inline V unlimited_at_or_behind(const L &l, V place) {
   return (place - l.before) * l.per_before + (l.first ? 1.0f : 0.0f);
@@ -83,7 +83,7 @@ inline V behind(const L &l, V place, bool ease) {
 }
 
 // The farther surface of a mixed pixel, whose share of the pixel is w, continues behind the nearer one with the extra weight
-// (1 - w) clamp((w - HIDDEN_WEIGHT) / CONTINUES_FROM, 0, 1); and the derivative. render/surfaces.py, continuation_weight.
+// (1 - w) clamp((w - HIDDEN_WEIGHT) / CONTINUES_FROM, 0, 1); and the derivative. render/surfaces/frame.py, continuation_weight.
 template <typename V>
 inline V unlimited_known(V share) {
   return (share - HIDDEN_WEIGHT) * (1.0f / CONTINUES_FROM);
@@ -99,7 +99,7 @@ inline V slope_of_continuation(V share) {
 }
 
 // Part of that weight that counts in a layer, where the nearer surface has a share at or behind the layer: 1 -
-// clamp(nearer / HIDING_SHARE, 0, 1); and the derivative. render/surfaces.py, visible_part.
+// clamp(nearer / HIDING_SHARE, 0, 1); and the derivative. render/surfaces/frame.py, visible_part.
 template <typename V>
 inline V visible_part(V nearer) {
   return 1.0f - clamp01(nearer * (1.0f / HIDING_SHARE));
@@ -111,7 +111,7 @@ inline V slope_of_visible_part(V nearer) {
 
 // Stand-ins for the background, each rule with its derivative. A surface at x counts as one at the focus by clamp(1 + x /
 // AT_FOCUS, 0, 1), and stands in by clamp(2 + x / BARELY_BLURRED, 0, 1) clamp(-x / OFF_FOCUS, 0, 1). With the weight w it takes
-// the place of a stand-in by clamp(COUNTED w, 0, 1), and has the weight max(w - SEEN_FROM, 0) as one. render/surfaces.py,
+// the place of a stand-in by clamp(COUNTED w, 0, 1), and has the weight max(w - SEEN_FROM, 0) as one. render/surfaces/frame.py,
 // at_focus, stands_in, counts and seen.
 template <typename V>
 inline V unlimited_at_focus(V place) { return place * (1.0f / AT_FOCUS) + 1.0f; }
@@ -143,7 +143,7 @@ template <typename V>
 inline V slope_of_counts(V weight) { return within(unlimited_counts(weight)) ? V{} + COUNTED : V{}; }
 
 // The normalizer of a layer, its weight w plus the weight v behind it, is raised where it is small: with l = max(KNOWN - w -
-// v, 0), by l^2 / (2 KNOWN), whose derivative by w or v is -l / KNOWN. render/composite.py, raised.
+// v, 0), by l^2 / (2 KNOWN), whose derivative by w or v is -l / KNOWN. render/layers/composite.py, raised.
 template <typename V>
 inline V lacking(V weight, V behind = V{}) { return most(V{} + KNOWN - weight - behind, V{}); }
 template <typename V>

@@ -1,0 +1,1 @@
+"""What computes the steps: the compiled engine, kernels of a GPU, plain PyTorch, and operators of traced graphs."""

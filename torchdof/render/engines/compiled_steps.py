@@ -1,0 +1,65 @@
+"""Steps of a differentiated rendering that the compiled engine computes, forward and backward."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ...validation import engine_reads
+
+
+def compiled_step(
+    forward: Callable[..., Tensor],
+    backward: Callable[..., Sequence[Tensor]],
+    plain: Callable[..., Tensor],
+    *tensors: Tensor,
+) -> Tensor | None:
+    """A step that the compiled engine computes for one item of a batch after the other.
+
+    Args:
+        forward: ``forward(*tensors)`` computes the step for one item, whose tensors lack the axis of the batch.
+        backward: ``backward(gradient, *tensors)`` computes its gradients by the first tensors; the others are constant.
+        plain: ``plain(*tensors)`` is the same step by PyTorch, for all items: for the gradients of gradients.
+        *tensors: Input of the step, ``[B, ...]``.
+
+    Returns:
+        None if the compiled engine is not in use or cannot read the tensors: it needs float32 on the CPU, and eager
+        code without function transforms.
+    """
+    if not engine_reads(*tensors, backward=True):
+        return None
+    result: Tensor = _Step.apply(forward, backward, plain, *tensors)
+    return result
+
+
+def plain_gradients(plain: Callable[..., Tensor], tensors: Sequence[Tensor], gradient: Tensor) -> list[Tensor | None]:
+    """The gradients of ``plain(*tensors)`` by its tensors, which can be differentiated again."""
+    tensors = [t.view_as(t) for t in tensors]  # one may be computed from another: gradients stop at the views
+    wanted = [t for t in tensors if t.requires_grad]
+    of_wanted = iter(torch.autograd.grad(plain(*tensors), wanted, gradient, create_graph=True))
+    return [next(of_wanted) if t.requires_grad else None for t in tensors]
+
+
+class _Step(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, forward: Any, backward: Any, plain: Any, *tensors: Tensor) -> Tensor:
+        ctx.backward_of_item, ctx.plain = backward, plain
+        ctx.save_for_backward(*tensors)
+        return _stacked([forward(*item) for item in zip(*(t.detach() for t in tensors), strict=True)])
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        (gradient,), tensors = gradients, ctx.saved_tensors
+        found: list[Tensor | None]
+        if torch.is_grad_enabled():  # the gradients will be differentiated again
+            found = plain_gradients(ctx.plain, tensors, gradient)
+        else:
+            items = zip(gradient, *(t.detach() for t in tensors), strict=True)
+            of_items = [ctx.backward_of_item(*item) for item in items]
+            found = [_stacked(of_tensor) for of_tensor in zip(*of_items, strict=True)]
+        return None, None, None, *found, *[None] * (len(tensors) - len(found))
+
+
+def _stacked(items: Sequence[Tensor]) -> Tensor:
+    return torch.stack([*items]) if len(items) > 1 else items[0][None]  # without a copy
