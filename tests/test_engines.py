@@ -297,6 +297,18 @@ def test_engines_agree_on_scenes_of_every_kind(name: str, by_both: Any) -> None:
     by_both(scene.blurred, scene.image)
 
 
+@pytest.mark.parametrize(("radius", "seed"), [(8.0, 58), (24.0, 4)])
+def test_noise_as_depth_with_many_lamps_is_rendered_as_in_float64(radius: float, seed: int, by_both: Any) -> None:
+    """Hardly any pixel lies on an emitter's surface there; a ratio of such small peaks would depend on rounding."""
+    generator = torch.Generator().manual_seed(seed)
+    image, coc, lamps = (torch.rand(1, n, 48, 83, generator=generator) for n in (3, 1, 1))
+    image, coc = torch.where(lamps < 0.1, 50.0, 0.1) * image, radius * (2.0 * coc - 1.0)
+    plan = Plan.for_scene(coc, 1 / 255)
+    by_both(lambda: blur_by_coc(image, coc, plan=plan), image)
+    exact = blur_by_coc(image.double(), coc.double(), plan=plan)
+    assert_same_picture(exact.float(), blur_by_coc(image, coc, plan=plan), image)
+
+
 @pytest.mark.parametrize("name", ["triangle", "blades", "image"])
 @pytest.mark.parametrize("occlusion", [True, False])
 def test_engines_and_fold_agree_on_asymmetric_kernels(name: str, occlusion: bool) -> None:

@@ -39,6 +39,7 @@ _UNBOUNDED = 1e6  # upper limit for either part, as a multiple of the brightest 
 _EMITTER_REACH = 3  # px; half the width of the window in which an emitter's surface is searched
 _TOUCHING = 2  # px; distance over which a soft image spreads the light of an emitter in front
 _DIM = 0.1  # fraction of the highlight below which all pixels are equally good samples of a surface's own light
+_LEAST_PEAK = 0.5  # least peak of a surface around a highlight, as a fraction of it; larger: fewer emitters are found
 _MOST_WEIGHT = 0.98  # largest weight of an emitter on another surface in a highlight's pixel
 
 
@@ -250,14 +251,16 @@ def attribute_emitters(
         """Confidence that the emitter lies behind (side 1) or in front of (-1) surfaces with coc ``coc``, 0 to 1.
 
         It is above 0 only if pixels there, ``among`` some of the window, have a peak above ``share`` times that of the
-        surfaces. Also returns the weights of the window's pixels beyond the surfaces, those of dim pixels on them, and
-        the larger of both peaks.
+        surfaces. The peak of a surface that hardly any pixel lies on is taken to be :data:`_LEAST_PEAK` of the
+        highlight: a ratio of two tiny peaks would depend on rounding. Also returns the weights of the window's pixels
+        beyond the surfaces, those of dim pixels on them, and the larger of both peaks.
         """
         away = side * (window_coc - coc)
         there = among * (away - 1.0).clamp(0.0, 1.0)
         same = counted * (2.0 - away.abs()).clamp(0.0, 1.0)
         dim = same * near_by * (2.5 - 5.0 * peaks / own_peak.clamp_min(1e-12)).clamp(0.0, 1.0)
-        emitter_peak, same_peak = (there * peaks).amax(0), (same * peaks).amax(0).clamp_min(1e-12)
+        emitter_peak = (there * peaks).amax(0)
+        same_peak = torch.maximum((same * peaks).amax(0), _LEAST_PEAK * own_peak).clamp_min(1e-12)
         sureness = excess * (10.0 * dim.sum(0)).clamp(max=1.0)
         sureness = sureness * (10.0 * (emitter_peak / same_peak - share)).clamp(0.0, 1.0)
         return sureness, there, dim, torch.maximum(emitter_peak, same_peak)
