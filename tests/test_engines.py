@@ -200,15 +200,22 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 @pytest.fixture
 def by_both(counted: list[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Compares the pictures of both engines, to 1e-5 of the light nearby, and checks that each engine was used."""
+    """Compares the pictures of both engines, to 1e-5 of the light nearby, and checks that each engine was used.
+
+    The compiled engine renders with the instructions of any processor, then with those of this one.
+    """
+    best = native._instructions
 
     def compared(make: Callable[[], Tensor], image: Tensor, in_focus: bool = False) -> None:
-        pictures = []
-        for engine in ("torch", "native"):
+        plain: Tensor | None = None
+        for engine, instructions in (("torch", best), ("native", "baseline"), ("native", best)):
             monkeypatch.setenv("TORCHDOF_ENGINE", engine)
-            pictures.append(make())
+            monkeypatch.setattr(native, "_instructions", instructions)
+            picture = make()
             assert bool(counted) == (engine == "native") or in_focus
-        assert_same_picture(pictures[0], pictures[1], image)
+            if plain is None:
+                plain = picture
+            assert_same_picture(plain, picture, image)
 
     return compared
 
