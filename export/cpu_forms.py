@@ -66,9 +66,10 @@ def concatenate_zeros(model: onnx_ir.Model) -> None:
         is_channels = len(ends) == 8 and ends[5] > 0 and not np.delete(ends, 5).any()
         value = constant(node.inputs[2]) if len(node.inputs) > 2 else np.zeros(())
         is_zero = node.attributes.get_string("mode", "constant") == "constant" and value is not None and not value.any()
-        sizes = None if shape is None else [n if isinstance(n, int) else None for n in shape]
-        if not (is_channels and is_zero and before.attributes["axis"].as_int() == 1) or not sizes or None in sizes:
+        is_known = shape is not None and all(isinstance(n, int) for n in shape)
+        if not (is_channels and is_zero and is_known and before.attributes["axis"].as_int() == 1):
             continue
+        sizes = list(map(int, shape))
         zeros = np.zeros((sizes[0], int(ends[5]), *sizes[2:]), np.float32)
         appended = initializer(model.graph, zeros, f"zeros_{node.outputs[0].name}")
         joined = onnx_ir.node("Concat", [*before.inputs, appended], {"axis": 1})

@@ -111,7 +111,7 @@ class GraphOps(Ops):
         size = next((tile for tile in _TILES if margin <= tile[0] // 2), _TILES[-1])
         counts = [(n + length - 1) // length for n, length in zip(frame.area, size, strict=True)]
         missing = [length * count - n for length, count, n in zip(size, counts, frame.area, strict=True)]
-        # what is added to whole tiles is farther from the frame than its margin, and has no effect in it
+        # pixels added to complete the tiles are farther from the frame than its margin, and have no effect in it
         ends = (0, missing[1], 0, missing[0])
         tiles = _Tiles(frame.surfaces[0].light.shape[0], *counts)
 
@@ -142,10 +142,10 @@ class _Tiles:
         """The window of a map for one tile of ``size``, with a margin."""
         shape = (1, int(values.shape[1]), size[0] + 2 * margin, size[1] + 2 * margin)
         first = torch.cat([self._item, torch.zeros_like(self._item), self._row * size[0], self._column * size[1]])
-        size = torch.tensor(shape)
-        cut = operator("Slice", [values, first, first + size], shape)
+        lengths = torch.tensor(shape)
+        cut = operator("Slice", [values, first, first + lengths], shape)
         # runtimes do not know the size of a slice, and use fast convolutions only for known sizes
-        return operator("Reshape", [cut, size], shape)
+        return operator("Reshape", [cut, lengths], shape)
 
     def joined(self, tile: Tensor) -> Tensor:
         """All tiles ``[1, C, h, w]`` as maps ``[B, C, rows * h, columns * w]``."""
