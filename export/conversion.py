@@ -164,14 +164,16 @@ def _translate(program: torch.export.ExportedProgram, portable: Portable, opset:
 
 
 def _index_copy(self: Any, dim: int, index: Any, source: Any) -> Any:
-    if dim != 1:
-        raise ValueError(f"values are put along axis 1 of [C, P], got axis {dim}")
-    changed = opset20.ScatterND(
-        opset20.Transpose(self, perm=[1, 0]),
-        opset20.Unsqueeze(index, opset20.Constant(value_ints=[1])),  # type: ignore[arg-type]
-        opset20.Transpose(source, perm=[1, 0]),
-    )
-    return opset20.Transpose(changed, perm=[1, 0])
+    return opset20.ScatterElements(self, _expanded(index, dim, source), source, axis=dim)
+
+
+def _expanded(index: Any, dim: int, source: Any) -> Any:
+    """An index ``[n]`` along one axis, in the shape of the values."""
+    others = [axis for axis in range(len(source.shape)) if axis != dim]
+    if not others:
+        return index
+    index = opset20.Unsqueeze(index, opset20.Constant(value_ints=others))  # type: ignore[arg-type]
+    return opset20.Expand(index, opset20.Shape(source))
 
 
 def _all(self: Any, dim: int, keepdim: bool = False) -> Any:
@@ -207,11 +209,7 @@ def _index_select(self: Any, dim: int, index: Any) -> Any:
 
 def _index_add(self: Any, dim: int, index: Any, source: Any) -> Any:
     # not ScatterND: runtimes add in parallel there, and would lose some values
-    others = [axis for axis in range(len(source.shape)) if axis != dim]
-    if others:
-        index = opset20.Unsqueeze(index, opset20.Constant(value_ints=others))  # type: ignore[arg-type]
-        index = opset20.Expand(index, opset20.Shape(source))
-    return opset20.ScatterElements(self, index, source, axis=dim, reduction="add")
+    return opset20.ScatterElements(self, _expanded(index, dim, source), source, axis=dim, reduction="add")
 
 
 def _floor_divide(self: Any, other: Any) -> Any:

@@ -4,6 +4,7 @@ A graph cannot choose its work before it runs. In a loop over tiles each step re
 without pixels in the window, and the whole tile if it is in focus.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 
 import torch
@@ -15,7 +16,7 @@ from torchdof.optics.blur_table import BlurTable
 from torchdof.pixels import Selected
 from torchdof.render.engines.ops import Level, Ops, Seen
 from torchdof.render.layers.plan import Plan
-from torchdof.render.surfaces.disocclusion import is_another_surface, search, shown_behind
+from torchdof.render.surfaces.disocclusion import counted_behind, is_another_surface, mean_behind, search
 from torchdof.render.surfaces.frame import Highlights, PaddedFrame, PaddedSurface
 
 from .rays import kernels_of, splat
@@ -23,7 +24,9 @@ from .structure import choose, collect, operator, steps
 
 __all__ = ["GraphOps", "WholeOps"]
 
-_SIDE = 96  # pixels of a tile; its maps fit into the processor's caches
+_TILES = ((96, 192), (128, 256), (256, 256))
+"""Rows and columns of a tile in pixels, for narrow and wide kernels. A map of a tile fits into the processor's caches.
+In most pictures depth changes less along a row than along a column, so that a wide tile has few layers."""
 _PART = 1024  # pixels of a list in one step; larger: fewer steps, more memory
 
 
@@ -62,20 +65,24 @@ class GraphOps(Ops):
         """Tile by tile, and only in tiles with pixels of the mask behind which a surface may lie."""
         size = (coc_px.shape[-2], coc_px.shape[-1])
         covered = [levels[0].step * n for n in levels[0].values.shape[-2:]]  # px; the levels are centred on the image
-        counts = [(n + _SIDE - 1) // _SIDE for n in covered]
-        missing = [_SIDE * count - n for count, n in zip(counts, covered, strict=True)]  # below and right
+        side = _TILES[0]
+        counts = [(n + length - 1) // length for n, length in zip(covered, side, strict=True)]
+        missing = [length * count - n for length, count, n in zip(side, counts, covered, strict=True)]  # below, right
         top, left = ((w - n) // 2 for w, n in zip(covered, size, strict=True))
         halves = [torch.scalar_tensor((w - n) % 2, dtype=coc_px.dtype) for w, n in zip(covered, size, strict=True)]
         ends = [left, covered[1] + missing[1] - size[1] - left, top, covered[0] + missing[0] - size[0] - top]
         padded = functional.pad(torch.cat([coc_px, mask], 1), ends, mode="replicate")
         tiles = _Tiles(padded.shape[0], *counts)
-        coc_px, mask = tiles.window(padded, _SIDE, 0).split(1, 1)
+        coc_px, mask = tiles.window(padded, side, 0).split(1, 1)
         windows, behind = [], []
         for level in levels:
             ends = [1, 1 + missing[1] // level.step, 1, 1 + missing[0] // level.step]
-            values = tiles.window(functional.pad(level.values, ends, mode="replicate"), _SIDE // level.step, 1)
+            of_level = (side[0] // level.step, side[1] // level.step)
+            values = tiles.window(functional.pad(level.values, ends, mode="replicate"), of_level, 1)
             windows.append(values)
-            behind.append(shown_behind(*_samples(values, (_SIDE, _SIDE), level.step, (halves[0], halves[1])), coc_px))
+            samples = _samples(values, side, level.step, (halves[0], halves[1]))
+            parts = [counted_behind(sample, share, coc_px) for sample, share in samples]
+            behind.append(mean_behind(*(functools.reduce(torch.add, each) for each in zip(*parts, strict=True))))
         lights, weights = (torch.stack(parts) for parts in zip(*behind, strict=True))
         surfaces = torch.cat(search(levels, lights, weights, coc_px), 1)
         nearest = torch.stack([values[:, -2].max() for values in windows]).max()
@@ -98,21 +105,22 @@ class GraphOps(Ops):
         nothing = rays.coc_px.new_zeros(coc_px.shape[0], len(rays.light), 1, 1)
         return choose(torch.ones_like(rays.pixels).sum() > 0, splats, nothing)
 
-    def align(self, margin: int, coarsest: int) -> int:
-        """Whole tiles, larger ones for wide kernels."""
-        return next((n for n in (_SIDE, 128) if margin <= n // 2), 256)
-
     def render(self, frame: PaddedFrame, render: Callable[[PaddedFrame], Tensor]) -> Tensor:
         """A loop over tiles, each rendered as a frame of its own unless it is sharp."""
         margin = frame.margin
-        tile_px = self.align(margin, 1)
-        tiles = _Tiles(frame.surfaces[0].light.shape[0], *(n // tile_px for n in frame.area))
-        surfaces = [
-            PaddedSurface(*(tiles.window(t, tile_px, margin) for t in s if t is not None)) for s in frame.surfaces
-        ]
-        behind = None if frame.behind is None else tiles.window(frame.behind, tile_px, 0)
-        inside = (..., slice(margin, margin + tile_px), slice(margin, margin + tile_px))
-        size = (tile_px, tile_px)
+        size = next((tile for tile in _TILES if margin <= tile[0] // 2), _TILES[-1])
+        counts = [(n + length - 1) // length for n, length in zip(frame.area, size, strict=True)]
+        missing = [length * count - n for length, count, n in zip(size, counts, frame.area, strict=True)]
+        # pixels added to complete the tiles are farther from the frame than its margin, and have no effect in it
+        ends = (0, missing[1], 0, missing[0])
+        tiles = _Tiles(frame.surfaces[0].light.shape[0], *counts)
+
+        def window(values: Tensor, margin: int) -> Tensor:
+            return tiles.window(functional.pad(values, ends, mode="replicate"), size, margin)
+
+        surfaces = [PaddedSurface(*(window(t, margin) for t in s if t is not None)) for s in frame.surfaces]
+        behind = None if frame.behind is None else window(frame.behind, 0)
+        inside = (..., slice(margin, margin + size[0]), slice(margin, margin + size[1]))
         tile_frame = PaddedFrame(surfaces, frame.nodes, frame.ramps, behind, margin, size, size, frame.occlusion)
         rendered, sharp = render(tile_frame), surfaces[0].light[inside]
         weights = int(rendered.shape[1]) - frame.colours  # of the light, in further channels; 1 where it is sharp
@@ -130,27 +138,28 @@ class _Tiles:
         self._step = steps(batch * rows * columns)
         self._item, self._row, self._column = pixels.places(self._step.reshape(1), rows, columns)
 
-    def window(self, values: Tensor, length: int, margin: int) -> Tensor:
-        """The window of a map for one tile of ``length`` pixels, with a margin."""
-        across = length + 2 * margin
-        shape = (1, int(values.shape[1]), across, across)
-        first = torch.cat([self._item, torch.zeros_like(self._item), self._row * length, self._column * length])
-        size = torch.tensor(shape)
-        cut = operator("Slice", [values, first, first + size], shape)
+    def window(self, values: Tensor, size: tuple[int, int], margin: int) -> Tensor:
+        """The window of a map for one tile of ``size``, with a margin."""
+        shape = (1, int(values.shape[1]), size[0] + 2 * margin, size[1] + 2 * margin)
+        first = torch.cat([self._item, torch.zeros_like(self._item), self._row * size[0], self._column * size[1]])
+        lengths = torch.tensor(shape)
+        cut = operator("Slice", [values, first, first + lengths], shape)
         # runtimes do not know the size of a slice, and use fast convolutions only for known sizes
-        return operator("Reshape", [cut, size], shape)
+        return operator("Reshape", [cut, lengths], shape)
 
     def joined(self, tile: Tensor) -> Tensor:
-        """All tiles ``[1, C, side, side]`` as maps ``[B, C, rows * side, columns * side]``."""
+        """All tiles ``[1, C, h, w]`` as maps ``[B, C, rows * h, columns * w]``."""
         batch, rows, columns = self._counts
-        channels, side = tile.shape[1:3]
+        channels, height, width = tile.shape[1:]
         tiles = collect(self._step, tile, batch * rows * columns)
-        maps = tiles.reshape(batch, rows, columns, channels, side, side).permute(0, 3, 1, 4, 2, 5)
-        return maps.reshape(batch, channels, rows * side, columns * side)
+        maps = tiles.reshape(batch, rows, columns, channels, height, width).permute(0, 3, 1, 4, 2, 5)
+        return maps.reshape(batch, channels, rows * height, columns * width)
 
 
-def _samples(values: Tensor, size: tuple[int, int], step: int, half_px: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """The four samples around each pixel of a map ``[B, C, 4, H, W]``, and their shares of the linear mean.
+def _samples(
+    values: Tensor, size: tuple[int, int], step: int, half_px: tuple[Tensor, Tensor]
+) -> list[tuple[Tensor, Tensor]]:
+    """The four samples around each pixel of a map, each ``[B, C, H, W]``, and their shares of the linear mean.
 
     The whole map is enlarged and shifted, because runtimes are slow at lists of single pixels. ``values``
     ``[B, C, h, w]`` are samples at every ``step``-th pixel, a power of two, with one more on each side; ``half_px`` is
@@ -163,12 +172,14 @@ def _samples(values: Tensor, size: tuple[int, int], step: int, half_px: tuple[Te
         position = 2 * torch.arange(n, device=values.device) + 2 * first + 1
         share = ((position % (2 * step)).to(values.dtype) + half) / (2 * step)
         shares.append((1.0 - share, share))
-    shifted = [
-        enlarged.narrow(-2, first + row * step, size[0]).narrow(-1, first + column * step, size[1])
+    return [
+        (
+            enlarged.narrow(-2, first + row * step, size[0]).narrow(-1, first + column * step, size[1]),
+            shares[0][row].reshape(-1, 1) * shares[1][column],  # not [:, None]: ONNX infers wrong values from it
+        )
         for row in (0, 1)
         for column in (0, 1)
     ]
-    return torch.stack(shifted, 2), torch.stack([y[:, None] * x for y in shares[0] for x in shares[1]])
 
 
 class WholeOps(Ops):

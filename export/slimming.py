@@ -13,6 +13,14 @@ from onnx_ir.passes import common as passes
 from onnx_ir.tape import Tape
 from onnxscript.optimizer import fold_constants
 
+from .cpu_forms import (
+    chain_reductions,
+    concatenate_zeros,
+    constant,
+    convolve_averages,
+    gather_rows,
+    initializer,
+)
 from .structure import structure
 
 __all__ = ["slim"]
@@ -28,7 +36,7 @@ def slim(model: onnx_ir.Model, straight: bool = False) -> onnx_ir.Model:
 
     A ``straight`` graph has none of these; its constants stay initializers, which runtimes for GPUs load once.
 
-    1. Inline functions, fold constants, and in tiles replace block means by convolutions.
+    1. Inline functions, fold constants, and in tiles use forms that are fast on CPUs (:mod:`.cpu_forms`).
     2. Make loops and branches.
     3. Put each convolution's weights into its own graph, and turn initializers into nodes.
     4. Remove default attributes and shorten names.
@@ -49,7 +57,7 @@ def slim(model: onnx_ir.Model, straight: bool = False) -> onnx_ir.Model:
         passes.ShapeInferencePass(),
         *((_share_sizes,) if straight else ()),
         _join_slices,
-        *(() if straight else (_convolve_averages,)),
+        *(() if straight else (convolve_averages, concatenate_zeros, chain_reductions, gather_rows)),
         passes.IdentityEliminationPass(),
         passes.CommonSubexpressionEliminationPass(),
         passes.RemoveUnusedNodesPass(),
@@ -75,7 +83,7 @@ def _share_sizes(model: onnx_ir.Model) -> None:
     sizes: dict[Any, list[Any]] = {}  # names of the sizes that a value holds
     for node in model.graph:
         source: Any = node.inputs[0] if node.inputs else None
-        numbers = [_constant(value) for value in node.inputs[1:]]
+        numbers = [constant(value) for value in node.inputs[1:]]
         if node.op_type == "Shape" and source.shape is not None:
             ends = [node.attributes[name].as_int() if name in node.attributes else None for name in ("start", "end")]
             held = list(source.shape)[slice(*ends)]
@@ -93,53 +101,31 @@ def _share_sizes(model: onnx_ir.Model) -> None:
 def _join_slices(model: onnx_ir.Model) -> None:
     """Makes one slice along several axes of slices in a row, and removes those that keep everything."""
     for node in model.graph:
-        numbers = [_constant(value) for value in node.inputs[1:]]
-        if node.op_type != "Slice" or len(numbers) != 4 or any(n is None for n in numbers):
+        numbers = _bounds(node)
+        if numbers is None:
             continue
         source: Any = node.inputs[0]
         if not numbers[0].any() and (numbers[1] > _WHOLE_AXIS).all() and (numbers[3] == 1).all():
             node.outputs[0].replace_all_uses_with(source)
             continue
         before = source.producer()
-        others = [_constant(value) for value in before.inputs[1:]] if before and before.op_type == "Slice" else []
-        if len(others) != 4 or any(n is None for n in others) or min(*numbers[2], *others[2]) < 0:
-            continue
-        if not set(numbers[2]) & set(others[2]):
+        others = _bounds(before)
+        if others is not None and min(*numbers[2], *others[2]) >= 0 and not set(numbers[2]) & set(others[2]):
             node.replace_input_with(0, before.inputs[0])
+            node.resize_inputs(5)
             for index, pair in enumerate(zip(others, numbers, strict=True)):
                 name = f"{node.outputs[0].name}_{index}"
-                node.replace_input_with(1 + index, _initializer(model.graph, np.concatenate(pair), name))
+                node.replace_input_with(1 + index, initializer(model.graph, np.concatenate(pair), name))
 
 
-def _constant(value: onnx_ir.Value | None) -> Any:
-    """The numbers of a constant, else None."""
-    tensor = None if value is None else onnx_ir.convenience.get_const_tensor(value)
-    return None if tensor is None else tensor.numpy()
-
-
-def _convolve_averages(model: onnx_ir.Model) -> None:
-    """Turns block means before a convolution into a convolution: onnxruntime's AveragePool is several times slower.
-
-    The channels are padded before it, to as many as runtimes take at once.
-    """
-    for node in [node for node in model.graph if node.op_type == "AveragePool"]:
-        following = [use.node for use in node.outputs[0].uses()]
-        if [n.op_type for n in following] != ["Pad"]:
-            continue
-        (pad,) = following
-        padded = pad.outputs[0]
-        scale, shape = node.attributes["kernel_shape"].as_ints()[0], cast(Any, padded.shape)
-        weight = np.full((int(shape[1]), 1, scale, scale), scale**-2.0, np.float32)
-        kernel = _initializer(model.graph, weight, f"mean_{padded.name}")
-        tape = Tape()
-        filled = tape.op("Pad", [node.inputs[0], *pad.inputs[1:]])
-        mean = tape.op(
-            "Conv", [filled, kernel], {"group": len(weight), "strides": [scale, scale]}, name=f"{kernel.name}_conv"
-        )
-        mean.type, mean.shape = padded.type, onnx_ir.Shape(shape)
-        model.graph.insert_before(pad, list(tape.nodes))
-        padded.replace_all_uses_with(mean)
-        model.graph.remove([pad, node], safe=True)
+def _bounds(node: onnx_ir.Node | None) -> list[Any] | None:
+    """Starts, ends, axes and steps of a slice; None if they are unknown. Axes are from 0 on if the rank is known."""
+    numbers = [constant(value) for value in node.inputs[1:]] if node is not None and node.op_type == "Slice" else []
+    if len(numbers) < 3 or any(n is None for n in numbers):
+        return None
+    numbers = numbers if len(numbers) > 3 else [*numbers, np.ones_like(numbers[2])]
+    shape = cast(Any, cast(Any, node).inputs[0]).shape
+    return [*numbers[:2], numbers[2] if shape is None else numbers[2] % len(shape), numbers[3]]
 
 
 def _place_weights(model: onnx_ir.Model) -> None:
@@ -153,9 +139,9 @@ def _place_weights(model: onnx_ir.Model) -> None:
             if bias is not None and bias.const_value is not None and not bias.const_value.numpy().any():
                 node.resize_inputs(2)
             rows, index = np.unique(weight.const_value.numpy(), axis=0, return_inverse=True)
-            local_weight = _initializer(graph, rows, f"{weight.name}_of_{node.name}")
+            local_weight = initializer(graph, rows, f"{weight.name}_of_{node.name}")
             if len(rows) < len(index):
-                channel_index = _initializer(graph, index.astype(np.int64), f"{local_weight.name}_channels")
+                channel_index = initializer(graph, index.astype(np.int64), f"{local_weight.name}_channels")
                 gather = onnx_ir.node("Gather", [local_weight, channel_index], {"axis": 0})
                 graph.insert_before(node, [gather])
                 local_weight = gather.outputs[0]
@@ -182,12 +168,6 @@ def _as_nodes(model: onnx_ir.Model) -> None:
             value.replace_all_uses_with(constant)
         if tape.nodes:
             graph.insert_before(next(iter(graph)), list(tape.nodes))
-
-
-def _initializer(graph: onnx_ir.Graph, array: np.ndarray, name: str) -> onnx_ir.Value:
-    value = onnx_ir.val(name, const_value=onnx_ir.tensor(array, name=name))
-    graph.register_initializer(value)
-    return value
 
 
 def _drop_defaults(model: onnx_ir.Model) -> None:

@@ -5,7 +5,7 @@ import { pathToFileURL } from 'node:url'
 
 const load = (path) => import(pathToFileURL(resolve('examples', path)).href)
 const { fillHoles, metresOf, readDepthMap } = await load('embed/javascript/depth.mjs')
-const { fNumberFor, guessMeaning, inOrder, subjectOf } = await load('web/src/assumed.mjs')
+const { fNumberFor, guessMeaning, inOrder, knownMap, subjectOf } = await load('web/src/assumed.mjs')
 const { cocPx, withoutRange } = await load('web/src/optics.mjs')
 
 const folder = process.argv[2]
@@ -14,7 +14,7 @@ const results = {}
 for (const name of readdirSync(folder).filter((name) => name.endsWith('.npy'))) {
   const map = await readDepthMap(readFileSync(join(folder, name)))
   const meaning = guessMeaning(map)
-  const metres = metresOf(map, { ...meaning, nearM: 1, farM: 8 })
+  const metres = metresOf(knownMap(map, meaning.kind), { ...meaning, nearM: 1, farM: 8 })
   fillHoles(metres, map.width)
   const subject = subjectOf(metres, map.width, map.height, meaning.kind)
   const focus = { nearM: subject.distanceM, farM: subject.distanceM }

@@ -57,6 +57,11 @@ def maps() -> dict[str, np.ndarray]:
     maps["whole floats"] = (1000 * ground).round()
     maps["close-up"] = np.linspace(0.9, 0.2, SIZE[0])[:, None].repeat(SIZE[1], 1)
     maps["close-up"][0, 0] = 0.0
+    for marked, value in (("millimetres 0", 65535), ("metres 2", 1e10), ("estimate 3", 65504.0)):
+        maps[f"{marked} with sentinels"] = maps[marked].copy()
+        maps[f"{marked} with sentinels"][100:120, 5:9] = value
+    maps["whole floats with two sentinels"] = maps["whole floats"].copy()
+    maps["whole floats with two sentinels"].flat[:90] = np.repeat([1e10, -1.0, 3e12], 30)
     maps["sky"] = np.where(person(1) > 0.5, 2.0, np.inf)
     maps["sky"][0, 0] = 9.0
     return maps

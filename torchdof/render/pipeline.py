@@ -387,8 +387,8 @@ def _composite(
     coarsest = max(blur.scale for blur in blurs)
     margin = -(-max(blur.halo for blur in blurs) // coarsest) * coarsest
     behind = None if behind is None else behind_pixels(behind, size)
-    lit, multiple = options.occlusion or options.normalize, ops.align(margin, coarsest)
-    frame = pad_to_frame(surfaces, behind, nodes, margin, multiple, options.occlusion, lit, limit, image)
+    lit = options.occlusion or options.normalize
+    frame = pad_to_frame(surfaces, behind, nodes, margin, coarsest, options.occlusion, lit, limit, image)
     scatter = functools.partial(convolve, turned=not options.table.is_round) if layered else fold
 
     def scattered(frame: PaddedFrame) -> Tensor:

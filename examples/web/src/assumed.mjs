@@ -1,6 +1,8 @@
 // What `torchdof render` assumes where no option says more: the kind of a depth map, the subject, the opening of the lens.
 // The rules are those of torchdof/depth/guess.py and torchdof/cli/lens.py; a test compares their results.
 
+import { withoutSentinels } from './sentinels.mjs'
+
 const MOST_SAMPLES = 65_536
 const LARGEST_8_BIT = 255
 const SMALLEST_16_BIT = 60_000
@@ -34,20 +36,19 @@ const PER_OUTLIER = 1000 // one pixel in 1000 is ignored as an outlier
  * @param {DepthMap} map
  * @returns {{kind: 'disparity' | 'depth' | 'metres', scale: number}} as `metresOf` takes them.
  */
-export function guessMeaning({ values, width, height, fullScale }) {
+export function guessMeaning(map) {
+  const { width, height } = map
+  const values = withoutSentinels(map.values)
   const isHole = holeTest(values)
-  let [low, high, positive, isWhole] = [Infinity, -Infinity, Infinity, true]
-  const levels = new Set() // the first different values
+  let [low, high, positive] = [Infinity, -Infinity, Infinity]
   for (const value of values) {
     if (!Number.isFinite(value) || isHole(value)) continue
     low = Math.min(low, value)
     high = Math.max(high, value)
     if (value > 0) positive = Math.min(positive, value)
-    isWhole &&= Number.isInteger(value)
-    if (levels.size < LEAST_LEVELS) levels.add(value)
   }
   if (low === 0 && positive > EMPTY_GAP * high) low = positive // 0 means "not measured"
-  isWhole = fullScale !== null || (isWhole && levels.size === LEAST_LEVELS)
+  const isWhole = holdsWholeNumbers(map, values)
   const downwards = growthDownwards(values, width, height, isHole)
   const isRelative = isWhole
     ? high <= LARGEST_8_BIT || high >= SMALLEST_16_BIT
@@ -62,6 +63,25 @@ export function guessMeaning({ values, width, height, fullScale }) {
   const [aspect, empty] = [width / height, values.filter((value) => value === 0).length / values.length]
   const isOfKitti = (KITTI_ASPECTS[0] < aspect && aspect < KITTI_ASPECTS[1]) || empty > KITTI_EMPTY
   return { kind: 'metres', scale: isOfKitti ? 1 / 256 : 0.001 }
+}
+
+/** A map in which pixels without depth are NaN. In renderings in metres, a huge number is the distance of the sky. */
+export function knownMap(map, kind) {
+  const values = withoutSentinels(map.values)
+  return kind === 'metres' && !holdsWholeNumbers(map, values) ? map : { ...map, values }
+}
+
+/** Whether a map holds whole numbers, by its file or by its values. */
+function holdsWholeNumbers({ fullScale }, values) {
+  if (fullScale !== null) return true
+  const isHole = holeTest(values)
+  const levels = new Set() // the first different values
+  for (const value of values) {
+    if (!Number.isFinite(value) || isHole(value)) continue
+    if (!Number.isInteger(value)) return false
+    if (levels.size < LEAST_LEVELS) levels.add(value)
+  }
+  return levels.size === LEAST_LEVELS
 }
 
 /** Whether a value marks pixels without depth: the negative number, if all negative numbers are the same. */

@@ -1,6 +1,6 @@
 // The page: turns files and controls into a scene and a lens, and shows the results.
 
-import { fNumberFor, guessMeaning, inOrder, subjectOf } from './assumed.mjs'
+import { fNumberFor, guessMeaning, inOrder, knownMap, subjectOf } from './assumed.mjs'
 import { depthAtSize, extremes, fillHoles, metresOf } from './depth.mjs'
 import { kindOf, readDepth, readPhoto } from './files.mjs'
 import { cocPx, depthPicture, distanceAt } from './optics.mjs'
@@ -146,7 +146,7 @@ function arrange() {
         'fits. Turn one of them.',
     )
   }
-  const metres = metresOf(map, {
+  const metres = metresOf(knownMap(map, $('kind').value), {
     kind: $('kind').value,
     scale: Number($('scale').value),
     nearM: Number($('near').value),
@@ -197,7 +197,7 @@ function noteDepth(holes, stretch) {
 function showTiles() {
   const pictures = {
     photo: photo && { name: photo.name, image: new ImageData(photo.rgba, photo.width, photo.height) },
-    depth: depthFile && { name: depthFile.name, image: greyImage(depthFile.map) },
+    depth: depthFile && { name: depthFile.name, image: greyImage(knownMap(depthFile.map, $('kind').value)) },
   }
   for (const [slot, shown] of Object.entries(pictures)) {
     const tile = document.querySelector(`[data-slot=${slot}]`)

@@ -17,6 +17,7 @@ constexpr float MOST_CLEAN = constants::matting::MOST_CLEAN;
 constexpr float ALIKE = constants::matting::ALIKE;
 constexpr float UNBOUNDED = constants::matting::UNBOUNDED;
 constexpr float DIM = constants::emitters::DIM;
+constexpr float LEAST_PEAK = constants::emitters::LEAST_PEAK;
 constexpr float MOST_WEIGHT = constants::emitters::MOST_WEIGHT;
 constexpr int EMITTER_REACH = constants::emitters::EMITTER_REACH;
 constexpr int TOUCHING = constants::emitters::TOUCHING;
@@ -674,7 +675,7 @@ class Around {
         if (s_.has_block(which)) peaks_[i] = peak_of(s_.block(which).own + place_in_block(row, column), BLOCK_PIXELS, s_.channels);
       }
     const float own_peak = light / scale, dim_below = 5.0f / std::max(own_peak, 1e-12f);
-    float dim_sum = 0, emitter_peak = 0, same_peak = 1e-12f;
+    float dim_sum = 0, emitter_peak = 0, same_peak = std::max(LEAST_PEAK * own_peak, 1e-12f);  // a ratio of tiny peaks would depend on rounding
     for (int i = 0; i < COUNT; i++) {
       const float counted = s_.valid ? s_.valid[at_[i]] : 1.0f, peak = peaks_[i] / scale, away = side * (coc_[i] - coc);
       const float same = counted * clamp01(2.0f - std::fabs(away));

@@ -79,10 +79,6 @@ class Ops:
         """Splats highlights to ``[B, C, H, W]``; ``obstacles`` are coc and cover of the occluders."""
         return splat()
 
-    def align(self, margin: int, coarsest: int) -> int:
-        """Number that divides height and width of a frame; here ``coarsest``, the scale of the coarsest layer."""
-        return coarsest
-
     def render(self, frame: PaddedFrame, render: Callable[[PaddedFrame], Tensor]) -> Tensor:
         """Renders a frame with the function ``render``."""
         return render(frame)

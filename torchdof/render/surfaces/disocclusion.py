@@ -463,13 +463,26 @@ def shown_behind(samples: Tensor, shares: Tensor, coc_px: Tensor) -> Seen:
     Returns:
         Light and coc ``[..., C + 1, h, w]``, and their weight ``[..., 1, h, w]``.
     """
-    count = samples.shape[-4] - 2
-    coc, weight = samples.narrow(-4, count, 1), samples.narrow(-4, count + 1, 1)
+    counted, weights = counted_behind(samples, shares, coc_px.unsqueeze(2), -4)
+    return mean_behind(counted.sum(-3), weights.sum(-3))
+
+
+def counted_behind(samples: Tensor, share: Tensor, coc_px: Tensor, channels: int = -3) -> Seen:
+    """Samples times the weights with which they count behind a map, ``[..., C + 1, h, w]``, and these weights.
+
+    ``channels`` is the axis of light, coc and weight of the samples, of which each has a share of the mean.
+    """
+    count = samples.shape[channels] - 2
+    coc, weight = samples.narrow(channels, count, 1), samples.narrow(channels, count + 1, 1)
     # the pixel's own surface may slope nearby by a part of its blur
-    part = shares * weight * is_another_surface(coc - end_of_surface(coc_px).unsqueeze(2))
-    total = part.sum(-3)
+    part = share * weight * is_another_surface(coc - end_of_surface(coc_px))
+    return samples.narrow(channels, 0, count + 1) * part, part
+
+
+def mean_behind(summed: Tensor, total: Tensor) -> Seen:
+    """The mean of the samples of which :func:`counted_behind` gives the terms; 0 if hardly any counts."""
     total = torch.where(total > _LEAST_SEEN, total, 0.0)
-    return (samples.narrow(-4, 0, count + 1) * part).sum(-3) / total.clamp_min(_LEAST_SEEN), total
+    return summed / total.clamp_min(_LEAST_SEEN), total
 
 
 def search(levels: Sequence[Level], shown: Tensor, weight: Tensor, coc_px: Tensor, farthest: bool = False) -> Seen:

@@ -15,6 +15,7 @@ __all__ = ["attribute_emitters"]
 _EMITTER_REACH = 3  # px; half the width of the window in which an emitter's surface is searched
 _TOUCHING = 2  # px; distance over which a soft image spreads the light of an emitter in front
 _DIM = 0.1  # fraction of the highlight below which all pixels are equally good samples of a surface's own light
+_LEAST_PEAK = 0.5  # least peak of a surface around a highlight, as a fraction of it; larger: fewer emitters are found
 _MOST_WEIGHT = 0.98  # largest weight of an emitter on another surface in a highlight's pixel
 
 
@@ -124,13 +125,15 @@ def _found(bright: _Bright, coc: Tensor, side: float | Tensor, among: Tensor, sh
     """Searches for emitters behind (side 1) or in front of (-1) surfaces with coc ``[P]``.
 
     There is one only if pixels there, ``among`` some of the window, have a peak above ``share`` times that of the
-    surfaces. ``peaks`` are those around, ``[n, P]``.
+    surfaces. ``peaks`` are those around, ``[n, P]``. The peak of a surface that hardly any pixel lies on is taken to be
+    :data:`_LEAST_PEAK` of the highlight: a ratio of two tiny peaks would depend on rounding.
     """
     away = side * (bright.coc_around - coc)
     there = among * (away - 1.0).clamp(0.0, 1.0)
     same = bright.counts * (2.0 - away.abs()).clamp(0.0, 1.0)
     dim = same * bright.near_by * (2.5 - 5.0 * peaks / bright.peak.clamp_min(1e-12)).clamp(0.0, 1.0)
-    emitter_peak, same_peak = (there * peaks).amax(0), (same * peaks).amax(0).clamp_min(1e-12)
+    emitter_peak = (there * peaks).amax(0)
+    same_peak = torch.maximum((same * peaks).amax(0), _LEAST_PEAK * bright.peak).clamp_min(1e-12)
     excess = (bright.peak / bright.limit - 1.0).clamp(0.0, 1.0)
     certainty = excess * (10.0 * dim.sum(0)).clamp(max=1.0)
     certainty = certainty * (10.0 * (emitter_peak / same_peak - share)).clamp(0.0, 1.0)

@@ -157,11 +157,12 @@ class PaddedFrame:
         Returns light ``m_k I``, ``[B, n, C, h, w]``, its weight ``m_k`` and the weight behind it ``M_k - m_k``,
         ``[B, n, 1, h, w]``.
         """
-        surfaces = [PaddedSurface(*(self.cut(t, halo) for t in s if t is not None)) for s in self.surfaces]
-        weights = weights_at_or_behind(torch.stack([s.x for s in surfaces]), self.ramps[..., first : first + count + 1])
-        weights = (eased(weights) if self.occlusion else weights).unsqueeze(3)
-        pairs = [(weight[:, :-1], weight[:, 1:]) for weight in weights.unbind(0)]
-        surfaces = [PaddedSurface(*(t.unsqueeze(1) for t in s if t is not None)) for s in surfaces]
+        ramps, pairs = self.ramps[..., first : first + count + 1], []
+        for surface in self.surfaces:  # one after the other: on a CPU their maps then stay in its caches
+            weights = weights_at_or_behind(self.cut(surface.x, halo), ramps)
+            weights = (eased(weights) if self.occlusion else weights).unsqueeze(2)
+            pairs.append((weights[:, :-1], weights[:, 1:]))
+        surfaces = [PaddedSurface(*(self.cut(t.unsqueeze(1), halo) for t in s if t is not None)) for s in self.surfaces]
         return (_stacked if self.stacked else _mixed)(surfaces, pairs)
 
     def stand_ins(self) -> tuple[Tensor, Tensor]:
