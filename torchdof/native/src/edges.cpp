@@ -1,4 +1,4 @@
-// Repairs the edges of a depth map: the compiled version of torchdof/render/edges.py, with the same constants.
+// Repairs the edges of a depth map: the compiled version of torchdof/render/surfaces/edges.py, with the same constants.
 //
 // The frame is processed in tiles of AREA x AREA pixels, and within a tile only where the map changes. Each tile is
 // copied with a margin, padded beyond the frame with the nearest border pixel, so that loops run in whole vectors.
@@ -10,7 +10,7 @@
 namespace torchdof {
 namespace {
 
-// Constants of render/edges.py, which gives their meanings, units and effects.
+// Constants of render/surfaces/edges.py, which gives their meanings, units and effects.
 constexpr int RINGS = constants::edges::RINGS;
 constexpr int RAMP_REACH = constants::edges::RAMP_REACH;
 constexpr int FLAT_REACH = constants::edges::FLAT_REACH;
