@@ -319,9 +319,9 @@ def _repair(
         weight = weight * torch.where(is_ramp > 0, (level - 0.5).abs() > _CLEAR_LEVEL, ring == _RINGS)
         is_clear = weight * torch.stack([level > 0.5, level <= 0.5])  # of the near and of the far surface
         agrees = is_clear * ((score > 0) == (level > 0.5))
-        doubts, *clear = sums((1.0 - is_ramp) * pixels.pick(wrong, sampled)[0], *is_clear, *agrees)
-        clear, agrees = torch.stack(clear).chunk(2)
-        is_related = (agrees + 0.25 * _PRIOR_COUNT > _RELATED * (clear + 0.5 * _PRIOR_COUNT)).any(0)
+        doubts, *sides = sums((1.0 - is_ramp) * pixels.pick(wrong, sampled)[0], *is_clear, *agrees)
+        clear, agreed = torch.stack(sides).chunk(2)
+        is_related = (agreed + 0.25 * _PRIOR_COUNT > _RELATED * (clear + 0.5 * _PRIOR_COUNT)).any(0)
         is_soft = is_soft & is_related
         is_inexact = is_related & (is_soft | (doubts > _EXACT * steps))
         doubtful = doubtful & is_inexact & torch.where(edges.is_ramp, is_soft, wrong > _DOUBTFUL)
