@@ -18,6 +18,7 @@ and pass through unchanged; a disc would move 1e-4 of their light.
 import math
 from collections.abc import Sequence
 
+import torch
 from torch import Tensor
 
 _SQUARE_PX = 0.5  # px of coc around which x changes from the square of the coc to the coc itself
@@ -74,9 +75,7 @@ def weights_at_or_behind(x: Tensor, ramps: Tensor) -> Tensor:
 
 
 def eased(weight: Tensor) -> Tensor:
-    """A ramp from 0 to 1 whose foot is a parabola, so that it leaves 0 slowly: ``f (2 w - f) / (F (2 - F))``.
-
-    ``w`` is the weight, F is :data:`_FOOT` and ``f = min(w, F)``. Both ends are exact.
-    """
+    """A ramp from 0 to 1 whose foot is a parabola, so that it leaves 0 slowly."""
+    slope = 1.0 / (1.0 - 0.5 * _FOOT)
     foot = weight.clamp(max=_FOOT)
-    return foot * (weight + weight - foot) * (1.0 / (_FOOT * (2.0 - _FOOT)))
+    return torch.maximum(1.0 - slope * (1.0 - weight), (0.5 * slope / _FOOT) * foot * foot)
