@@ -1,4 +1,4 @@
-"""Steps of a differentiated rendering that the compiled engine computes, forward and backward."""
+"""Steps of a differentiated rendering that compiled code computes, forward and backward."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -29,11 +29,32 @@ def compiled_step(
     """
     if not engine_reads(*tensors, backward=True):
         return None
+
+    def of_batch(*tensors: Tensor) -> Tensor:
+        return _stacked([forward(*item) for item in zip(*tensors, strict=True)])
+
+    def gradients_of_batch(*tensors: Tensor) -> list[Tensor]:
+        of_items = [backward(*item) for item in zip(*tensors, strict=True)]
+        return [_stacked(of_tensor) for of_tensor in zip(*of_items, strict=True)]
+
+    return differentiable(of_batch, gradients_of_batch, plain, *tensors)
+
+
+def differentiable(
+    forward: Callable[..., Tensor],
+    backward: Callable[..., Sequence[Tensor]],
+    plain: Callable[..., Tensor],
+    *tensors: Tensor,
+) -> Tensor:
+    """``forward(*tensors)`` of compiled code, whose gradients are those of ``backward``.
+
+    The arguments are those of :func:`compiled_step`, but the functions take whole batches.
+    """
     result: Tensor = _Step.apply(forward, backward, plain, *tensors)
     return result
 
 
-def plain_gradients(plain: Callable[..., Tensor], tensors: Sequence[Tensor], gradient: Tensor) -> list[Tensor | None]:
+def _plain_gradients(plain: Callable[..., Tensor], tensors: Sequence[Tensor], gradient: Tensor) -> list[Tensor | None]:
     """The gradients of ``plain(*tensors)`` by its tensors, which can be differentiated again."""
     tensors = [t.view_as(t) for t in tensors]  # one may be computed from another: gradients stop at the views
     wanted = [t for t in tensors if t.requires_grad]
@@ -44,20 +65,19 @@ def plain_gradients(plain: Callable[..., Tensor], tensors: Sequence[Tensor], gra
 class _Step(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, forward: Any, backward: Any, plain: Any, *tensors: Tensor) -> Tensor:
-        ctx.backward_of_item, ctx.plain = backward, plain
+        ctx.gradients, ctx.plain = backward, plain
         ctx.save_for_backward(*tensors)
-        return _stacked([forward(*item) for item in zip(*(t.detach() for t in tensors), strict=True)])
+        result: Tensor = forward(*(t.detach() for t in tensors))
+        return result
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         (gradient,), tensors = gradients, ctx.saved_tensors
         found: list[Tensor | None]
         if torch.is_grad_enabled():  # the gradients will be differentiated again
-            found = plain_gradients(ctx.plain, tensors, gradient)
+            found = _plain_gradients(ctx.plain, tensors, gradient)
         else:
-            items = zip(gradient, *(t.detach() for t in tensors), strict=True)
-            of_items = [ctx.backward_of_item(*item) for item in items]
-            found = [_stacked(of_tensor) for of_tensor in zip(*of_items, strict=True)]
+            found = [*ctx.gradients(gradient, *(t.detach() for t in tensors))]
         return None, None, None, *found, *[None] * (len(tensors) - len(found))
 
 

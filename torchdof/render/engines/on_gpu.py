@@ -16,10 +16,10 @@ from torch import Tensor
 
 from ... import native
 from ...kernels import layers
-from ...tensors import is_in_memory, is_traced, without_autocast
+from ...tensors import is_differentiated, is_in_memory, is_traced, without_autocast
 from ..layers.layer_weights import ramps
 from ..surfaces.frame import PaddedFrame, PaddedSurface, maps_of, surfaces_of
-from .compiled_steps import plain_gradients
+from .compiled_steps import differentiable
 
 DEVICE = "cuda"
 """Type of the devices that have kernels."""
@@ -120,34 +120,21 @@ def _trial(channels: int, surfaces: int, stacked: bool, device: torch.device) ->
 
 
 def _by_kernels(frame: PaddedFrame, kernels: Kernels, plain: Plain) -> Tensor:
-    result: Tensor = _Layers.apply(frame, kernels, plain, *maps_of(frame.surfaces))
-    return result
+    maps, count = maps_of(frame.surfaces), len(frame.surfaces)
+    kept: list[layers.Kept] | None = [] if any(map(is_differentiated, maps)) else None
+    frame = dataclasses.replace(frame, surfaces=[])  # autograd keeps the maps
 
+    def with_maps(maps: Sequence[Tensor]) -> PaddedFrame:
+        return dataclasses.replace(frame, surfaces=surfaces_of(maps, count))
 
-class _Layers(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, frame: PaddedFrame, kernels: Kernels, plain: Plain, *maps: Tensor) -> Tensor:
-        ctx.save_for_backward(*maps)
-        count, frame = len(frame.surfaces), dataclasses.replace(frame, surfaces=[])  # autograd keeps the maps
-        ctx.kept = [] if any(ctx.needs_input_grad) else None
+    def picture(*maps: Tensor) -> Tensor:
+        return _composite(with_maps(maps), kernels).picture(kept)
 
-        def with_maps(maps: Sequence[Tensor]) -> PaddedFrame:
-            return dataclasses.replace(frame, surfaces=surfaces_of(maps, count))
+    def gradients(gradient: Tensor, *maps: Tensor) -> list[Tensor]:
+        found = _composite(with_maps(maps), kernels).gradients(gradient, kept or [])
+        return [t for t in found if t is not None]
 
-        ctx.plain = lambda *maps: plain(with_maps(maps), kernels)
-        ctx.composite = lambda maps: _composite(with_maps(maps), kernels)
-        picture: Tensor = ctx.composite(maps).picture(ctx.kept)
-        return picture
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        (gradient,), maps = gradients, ctx.saved_tensors
-        found: Sequence[Tensor | None]
-        if torch.is_grad_enabled():  # the gradients will be differentiated again
-            found = plain_gradients(ctx.plain, maps, gradient)
-        else:
-            found = [t for t in ctx.composite(maps).gradients(gradient, ctx.kept) if t is not None]
-        return None, None, None, *found
+    return differentiable(picture, gradients, lambda *maps: plain(with_maps(maps), kernels), *maps)
 
 
 def _composite(frame: PaddedFrame, kernels: Kernels) -> layers.Composite:
@@ -163,7 +150,7 @@ def _composite(frame: PaddedFrame, kernels: Kernels) -> layers.Composite:
         frame.behind is not None,
     )
     surfaces = [
-        (light.detach().contiguous(), x.detach().contiguous(), None if weight is None else weight.detach().contiguous())
+        (light.contiguous(), x.contiguous(), None if weight is None else weight.contiguous())
         for light, x, weight in frame.surfaces
     ]
     return layers.Composite(given, surfaces)
