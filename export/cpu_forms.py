@@ -47,13 +47,9 @@ def convolve_averages(model: onnx_ir.Model) -> None:
         filled = tape.op("Pad", [node.inputs[0], *pad.inputs[1:]])
         fine = cast(Any, cast(Any, node.inputs[0]).shape)
         filled.shape, filled.type = onnx_ir.Shape([fine[0], shape[1], *fine[2:]]), padded.type
-        mean = tape.op(
-            "Conv", [filled, kernel], {"group": len(weight), "strides": [scale, scale]}, name=f"{kernel.name}_conv"
-        )
-        mean.type, mean.shape = padded.type, onnx_ir.Shape(shape)
-        model.graph.insert_before(pad, list(tape.nodes))
-        padded.replace_all_uses_with(mean)
-        model.graph.remove([pad, node], safe=True)
+        tape.op("Conv", [filled, kernel], {"group": len(weight), "strides": [scale, scale]}, name=f"{kernel.name}_conv")
+        _replace(model.graph, pad, tape)
+        model.graph.remove(node, safe=True)
 
 
 def concatenate_zeros(model: onnx_ir.Model) -> None:
@@ -72,11 +68,9 @@ def concatenate_zeros(model: onnx_ir.Model) -> None:
         sizes = list(map(int, shape))
         zeros = np.zeros((sizes[0], int(ends[5]), *sizes[2:]), np.float32)
         appended = initializer(model.graph, zeros, f"zeros_{node.outputs[0].name}")
-        joined = onnx_ir.node("Concat", [*before.inputs, appended], {"axis": 1})
-        joined.outputs[0].type, joined.outputs[0].shape = node.outputs[0].type, shape
-        model.graph.insert_before(node, [joined])
-        node.outputs[0].replace_all_uses_with(joined.outputs[0])
-        model.graph.remove(node, safe=True)
+        tape = Tape()
+        tape.op("Concat", [*before.inputs, appended], {"axis": 1})
+        _replace(model.graph, node, tape)
 
 
 def chain_reductions(model: onnx_ir.Model) -> None:
@@ -98,11 +92,8 @@ def chain_reductions(model: onnx_ir.Model) -> None:
             result = tape.op(_PAIRWISE[node.op_type], [result, part])
         if not node.attributes.get_int("keepdims", 1):
             at = initializer(model.graph, np.array([axis]), f"axis_{node.outputs[0].name}")
-            result = tape.op("Squeeze", [result, at])
-        result.type, result.shape = node.outputs[0].type, node.outputs[0].shape
-        model.graph.insert_before(node, list(tape.nodes))
-        node.outputs[0].replace_all_uses_with(result, replace_graph_outputs=True)
-        model.graph.remove(node, safe=True)
+            tape.op("Squeeze", [result, at])
+        _replace(model.graph, node, tape)
 
 
 def gather_rows(model: onnx_ir.Model) -> None:
@@ -118,8 +109,15 @@ def gather_rows(model: onnx_ir.Model) -> None:
         turned = {"perm": [*range(rank - 2), rank - 1, rank - 2]}
         tape = Tape()
         rows = tape.op("Gather", [tape.op("Transpose", [source], turned), index], {"axis": rank - 2})
-        columns = tape.op("Transpose", [rows], turned)
-        columns.type, columns.shape = node.outputs[0].type, node.outputs[0].shape
-        model.graph.insert_before(node, list(tape.nodes))
-        node.outputs[0].replace_all_uses_with(columns, replace_graph_outputs=True)
-        model.graph.remove(node, safe=True)
+        tape.op("Transpose", [rows], turned)
+        _replace(model.graph, node, tape)
+
+
+def _replace(graph: onnx_ir.Graph, node: onnx_ir.Node, tape: Tape) -> None:
+    """Puts the nodes of a tape in place of a node; the output of the last one replaces that of the node."""
+    (old,), nodes = node.outputs, list(tape.nodes)
+    (new,) = nodes[-1].outputs
+    new.type, new.shape = old.type, old.shape
+    graph.insert_before(node, nodes)
+    old.replace_all_uses_with(new, replace_graph_outputs=True)
+    graph.remove(node, safe=True)

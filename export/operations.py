@@ -66,8 +66,7 @@ class GraphOps(Ops):
         size = (coc_px.shape[-2], coc_px.shape[-1])
         covered = [levels[0].step * n for n in levels[0].values.shape[-2:]]  # px; the levels are centred on the image
         side = _TILES[0]
-        counts = [(n + length - 1) // length for n, length in zip(covered, side, strict=True)]
-        missing = [length * count - n for length, count, n in zip(side, counts, covered, strict=True)]  # below, right
+        counts, missing = _counts(covered, side)
         top, left = ((w - n) // 2 for w, n in zip(covered, size, strict=True))
         halves = [torch.scalar_tensor((w - n) % 2, dtype=coc_px.dtype) for w, n in zip(covered, size, strict=True)]
         ends = [left, covered[1] + missing[1] - size[1] - left, top, covered[0] + missing[0] - size[0] - top]
@@ -109,8 +108,7 @@ class GraphOps(Ops):
         """A loop over tiles, each rendered as a frame of its own unless it is sharp."""
         margin = frame.margin
         size = next((tile for tile in _TILES if margin <= tile[0] // 2), _TILES[-1])
-        counts = [(n + length - 1) // length for n, length in zip(frame.area, size, strict=True)]
-        missing = [length * count - n for length, count, n in zip(size, counts, frame.area, strict=True)]
+        counts, missing = _counts(frame.area, size)
         # pixels added to complete the tiles are farther from the frame than its margin, and have no effect in it
         ends = (0, missing[1], 0, missing[0])
         tiles = _Tiles(frame.surfaces[0].light.shape[0], *counts)
@@ -128,6 +126,12 @@ class GraphOps(Ops):
             sharp = torch.cat([sharp, torch.ones_like(sharp[:, :weights])], 1)
         is_blurred = torch.stack([s.x.abs().max() for s in surfaces]).max() > 0
         return tiles.joined(choose(is_blurred, rendered, sharp))[..., : frame.size[0], : frame.size[1]]
+
+
+def _counts(area: Sequence[int], size: tuple[int, int]) -> tuple[list[int], list[int]]:
+    """Rows and columns of tiles of a size that cover an area, and the pixels that they add below and to the right."""
+    counts = [(n + length - 1) // length for n, length in zip(area, size, strict=True)]
+    return counts, [length * count - n for length, count, n in zip(size, counts, area, strict=True)]
 
 
 class _Tiles:
