@@ -120,7 +120,8 @@ function setMeaning({ kind, scale }) {
 
 /** Makes a scene from photo, depth map and its kind; shows a message if one is missing or does not fit. */
 function arrange() {
-  showTiles()
+  const map = depthFile && knownMap(depthFile.map, $('kind').value)
+  showTiles(map)
   scene = null
   result = null
   $('save').disabled = true
@@ -137,7 +138,6 @@ function arrange() {
     say(photo ? NEEDS_DEPTH : 'Now add the photo of this depth map.')
     return
   }
-  const { map } = depthFile
   const [ours, theirs] = [photo.width / photo.height, map.width / map.height]
   const stretch = difference(ours, theirs)
   if (stretch > SAME_SHAPE && difference(ours, 1 / theirs) <= SAME_SHAPE) {
@@ -146,7 +146,7 @@ function arrange() {
         'fits. Turn one of them.',
     )
   }
-  const metres = metresOf(knownMap(map, $('kind').value), {
+  const metres = metresOf(map, {
     kind: $('kind').value,
     scale: Number($('scale').value),
     nearM: Number($('near').value),
@@ -194,10 +194,10 @@ function noteDepth(holes, stretch) {
   $('depth-note').textContent = notes.join(' ')
 }
 
-function showTiles() {
+function showTiles(map) {
   const pictures = {
     photo: photo && { name: photo.name, image: new ImageData(photo.rgba, photo.width, photo.height) },
-    depth: depthFile && { name: depthFile.name, image: greyImage(knownMap(depthFile.map, $('kind').value)) },
+    depth: depthFile && { name: depthFile.name, image: greyImage(map) },
   }
   for (const [slot, shown] of Object.entries(pictures)) {
     const tile = document.querySelector(`[data-slot=${slot}]`)
