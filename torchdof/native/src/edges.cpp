@@ -233,7 +233,8 @@ class Repair {
   explicit Repair(const torchdof_map &map)
       : map_(map), sign_(map.of_coc ? -1.0f : 1.0f), height_(map.height), width_(map.width), channels_(map.channels), area_((size_t)map.height * map.width), score_(area_), evidence_(area_), marks_(area_) {}
 
-  // 1. Find the edges of a sample of the frame, see whether the map is soft, and decide by colour which surface each pixel shows.
+  // 1. Find the edges of a sample of the frame, see whether the map is soft, and decide by colour which surface each
+  //    pixel shows.
   // 2. Calibrate: for each kind of edge pixel, the share that shows the near surface.
   // 3. In automatic mode stop here if the map is exact or its edges are unrelated to the image's.
   // 4. Find and decide the edges of the whole frame; move pixels that have the depth of the wrong surface.
