@@ -314,11 +314,13 @@ def joined_layers(
 
 def _stacked(kernels: Sequence[Tensor | None]) -> Tensor:
     """Kernels ``[1 or C, k, k]`` of one layer, padded to one size: ``[B, 1 or C, k, k]``. None becomes zeros."""
-    largest = max((kernel for kernel in kernels if kernel is not None), key=lambda kernel: kernel.shape[-1])
-    half = largest.shape[-1] // 2
-    empty = torch.zeros_like(largest)
-    padded = [empty if k is None else functional.pad(k, (half - k.shape[-1] // 2,) * 4) for k in kernels]
-    return torch.stack(padded)
+    used = [(i, kernel) for i, kernel in enumerate(kernels) if kernel is not None]
+    largest = max((kernel for _, kernel in used), key=lambda kernel: kernel.shape[-1])
+    stacked = largest.new_zeros((len(kernels), *largest.shape))
+    for i, kernel in used:
+        spare = (largest.shape[-1] - kernel.shape[-1]) // 2
+        stacked[i, :, spare : spare + kernel.shape[-1], spare : spare + kernel.shape[-1]] = kernel
+    return stacked
 
 
 def _moved(kernels: Sequence[Tensor], device: torch.device, dtype: torch.dtype) -> list[Tensor]:
