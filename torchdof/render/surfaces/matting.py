@@ -24,6 +24,7 @@ NEVER_PX = 1e9
 """A coc in pixels that no pixel has: marks the absence of a surface."""
 
 _EDGE_PX = 0.5  # px; smallest difference in coc of neighbours on two surfaces; larger: fewer edges
+_SAME_BLUR = 0.1  # difference in coc, over the smaller blur, that one surface may have as well; larger: fewer edges
 FALLOFF = math.exp(-1 / 4.5)  # weight of a neighbour at a distance of 1 px: a Gaussian of sigma 1.5
 _UNCLEAN = 1e-2  # weight in a surface's mean colour of pixels that may be mixed; others have 1
 _TRUST = 10.0  # weight of variance against contrast; larger: texture stops more splits by colour
@@ -172,7 +173,9 @@ def _edge_pixels(light: Tensor, coc_px: Tensor, valid: Tensor | None, ops: Ops) 
     if counts is not None:
         near_px, far_px = torch.where(counts > 0, near_px, NEVER_PX), torch.where(counts > 0, far_px, -NEVER_PX)
     near_px, far_px = near_px.amin(0), far_px.amax(0)
-    certainty = ((far_px - near_px) / _EDGE_PX - 1.0).clamp(0.0, 1.0)
+    # in a strong blur a small difference is not seen, and a split would keep the hidden sample out of the pixel
+    one_surface_px = _SAME_BLUR * torch.minimum(near_px.abs(), far_px.abs())
+    certainty = ((far_px - near_px - one_surface_px) / _EDGE_PX - 1.0).clamp(0.0, 1.0)
     lights, cocs = (own_light / brightest, around / brightest), (chosen.pick(coc_px)[0], coc_around)
     return _EdgePixels(chosen, brightest, *lights, *cocs, counts, near_px, far_px, certainty)
 
