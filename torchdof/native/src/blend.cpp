@@ -11,12 +11,27 @@
 // Backward, the blurred l, w and v are computed again and kept, block by block; their gradients replace them. Each block
 // then composites its layers again, walks back through them from near to far, and the gradients of l, w and v are
 // scattered by the turned kernels to the gradients of m I, m and r, and from these to the surfaces.
-#include "engine.h"
+#include <algorithm>
+#include <cstdint>
+#include <cstring>
+#include <vector>
+
+#include "api.h"
+#include "blocks.h"
+#include "blur_axis.h"
+#include "constants/native.h"
+#include "convolution.h"
+#include "entry.h"
+#include "layers.h"
+#include "memory.h"
 #include "rules.h"
+#include "simd.h"
+#include "threads.h"
 
 namespace torchdof {
 namespace {
 
+constexpr int MOST_PLANES = constants::native::MOST_PLANES;
 static_assert(BLOCK % STRIP_COLUMNS == 0 && BLOCK % STRIP_ROWS == 0, "strips fill a block");
 
 inline vec load_some(const float *p, int n) {
@@ -314,7 +329,7 @@ class Blend {
     return index < 0 ? nullptr : blurred_[k].values.data() + (size_t)index * values_ * BLOCK_PIXELS;
   }
 
-  vec weight_at(int j, size_t at, int n) const { return scene_.weight[j] ? load_some(scene_.weight[j] + at, n) : all(1.0f); }
+  vec weight_at(int j, size_t at, int n) const { return scene_.weight[j] ? load_some(scene_.weight[j] + at, n) : broadcast(1.0f); }
 
   // The surfaces of some pixels, near to far, in a layer.
   struct Pixels {
@@ -382,7 +397,7 @@ class Blend {
         if (s == 1)
           n == LANES ? store(to, term) : add_some(to, term, n);
         else if (s >= LANES)
-          to[0] += part * sum(term);
+          to[0] += part * reduce_add(term);
         else
           for (int i = 0; i < n; i++) to[i / s] += part * term[i];
       };
@@ -459,7 +474,7 @@ class Blend {
   struct Front {
     vec share, transmittance;  // of a layer in a pixel; for the light behind it
   };
-  Front front(vec share) const { return {share, scene_.backed ? share : most(all(1.0f) - share, vec{})}; }
+  Front front(vec share) const { return {share, scene_.backed ? share : max(1.0f - share, vec{})}; }
   struct Normalizer {
     vec lacking, behind, sum;  // what the sum lacks to KNOWN; the share behind the layer, raised; their sum
   };
@@ -529,7 +544,7 @@ class Blend {
     each_pixel([&](int e, int i) {
       const vec own = load<vec>(values + (C_ + e) * BLOCK_PIXELS + i);
       const Normalizer n = normalizer_of(own, load<vec>(values + (C_ + E_ + e) * BLOCK_PIXELS + i));
-      const vec per = all(1.0f) / n.sum;
+      const vec per = 1.0f / n.sum;
       over(e, i, front((scene_.backed ? n.behind : own) * per), values, per, canvas);
     });
     return true;
@@ -553,7 +568,7 @@ class Blend {
     }
     return s;
   }
-  vec alone(const StandIns &s, int j) const { return S_ > 1 ? s.missing[1 - j] : all(1.0f); }
+  vec alone(const StandIns &s, int j) const { return S_ > 1 ? s.missing[1 - j] : broadcast(1.0f); }
   // Calls body(i, at, n, stand_ins) for up to LANES pixels at a time, i in a block of the picture and `at` in the padded
   // frame, where any surface stands in.
   template <typename Body>
@@ -567,7 +582,7 @@ class Blend {
         if (any_positive(s.sum)) body(y * BLOCK + x, at, n, s);
       }
   }
-  Front front_of(const StandIns &s) const { return front(scene_.backed ? all(1.0f) - s.sum : s.sum); }
+  Front front_of(const StandIns &s) const { return front(scene_.backed ? 1.0f - s.sum : s.sum); }
   bool put_stand_ins(int block, float *canvas) const {
     bool any = false;
     float light[MOST * BLOCK_PIXELS];
@@ -578,7 +593,7 @@ class Blend {
         for (int j = 0; j < S_; j++) sum += s.cover[j] * load_some(scene_.light[j] + c * map_ + at, n);
         store(light + c * BLOCK_PIXELS + i, sum);
       }
-      for (int e = 0; e < E_; e++) over(e, i, front_of(s), light, all(1.0f), canvas);
+      for (int e = 0; e < E_; e++) over(e, i, front_of(s), light, broadcast(1.0f), canvas);
     });
     return any;
   }
@@ -689,7 +704,7 @@ class Blend {
   bool join(const Run &run, int block, float *canvas, float *values) const {
     if (!widen(run, block, values)) return false;
     if (over_)
-      each_pixel([&](int e, int i) { over(e, i, front(load<vec>(values + (C_ + e) * BLOCK_PIXELS + i)), values, all(1.0f), canvas); });
+      each_pixel([&](int e, int i) { over(e, i, front(load<vec>(values + (C_ + e) * BLOCK_PIXELS + i)), values, broadcast(1.0f), canvas); });
     else
       add(values, canvas);
     return true;
@@ -729,7 +744,7 @@ class Blend {
       store(its, f.transmittance * slope);
     }
     store(coverage, f.transmittance * of_coverage);
-    return scene_.backed ? of_transmittance : of_coverage - (f.share <= all(1.0f) ? of_transmittance : vec{});
+    return scene_.backed ? of_transmittance : of_coverage - (f.share <= 1.0f ? of_transmittance : vec{});
   }
 
   // Walks back through a layer: its blurred terms become their gradients.
@@ -742,7 +757,7 @@ class Blend {
     each_pixel([&](int e, int i) {
       float *own = values + (C_ + e) * BLOCK_PIXELS + i, *behind_it = values + (C_ + E_ + e) * BLOCK_PIXELS + i;
       const Normalizer n = normalizer_of(load<vec>(own), load<vec>(behind_it));
-      const vec per = all(1.0f) / n.sum, share = (scene_.backed ? n.behind : load<vec>(own)) * per;
+      const vec per = 1.0f / n.sum, share = (scene_.backed ? n.behind : load<vec>(own)) * per;
       vec of_sum = {};
       const vec of_share = through(e, i, front(share), behind, slopes, [&](int c, vec slope) {
         float *its = values + c * BLOCK_PIXELS + i;

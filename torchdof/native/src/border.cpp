@@ -1,5 +1,16 @@
 // Estimates the light beyond the frame's border, as described in render/surfaces/border.py.
-#include "engine.h"
+#include "border.h"
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <vector>
+
+#include "blur_axis.h"
+#include "highlights.h"
+#include "job.h"
+#include "numbers.h"
+#include "simd.h"
 
 namespace torchdof {
 
@@ -23,7 +34,7 @@ WindowSums::WindowSums(int length, int count, const double *values, const double
     bin_[at] = std::min((int)places[at], BINS - 2);
     part_[at] = places[at] - bin_[at];
     // shares of the pixel in each bin and all farther ones
-    const bins shares = least(most(places[at] - before, bins{}), bins{} + 1.0);
+    const bins shares = min(max(places[at] - before, bins{}), bins{} + 1.0);
     for (int n = 0; n < count; n++, until += BINS) store(until + count * BINS, load<bins>(until) + shares * *values++);
   }
 }

@@ -5,8 +5,27 @@
 //
 // Runs of layers of a coarser resolution are composited first, each on a canvas of its own resolution. Then each tile
 // composites its full-resolution layers and these canvases while it is in the cache.
-#include "engine.h"
+#include "composite.h"
+
+#include <algorithm>
+#include <cstdint>
+#include <cstring>
+#include <memory>
+#include <vector>
+
+#include "blocks.h"
+#include "border.h"
+#include "constants/composite.h"
+#include "convolution.h"
+#include "disocclusion.h"
+#include "downsampling.h"
+#include "field_mask.h"
+#include "highlights.h"
+#include "job.h"
+#include "layers.h"
+#include "memory.h"
 #include "rules.h"
+#include "simd.h"
 
 namespace torchdof {
 namespace {
@@ -227,7 +246,7 @@ class Composite {
             for (int i = 0; i < s_.count; i++) {
               // places: of all pixels; shown: of pixels with weight. A row cut off by the frame repeats its last pixel.
               float places[CELL * CELL], shown[CELL * CELL], cut_coc[CELL], cut_weight[CELL];
-              vec lows = all(NEVER), highs = all(-NEVER), least_weight = all(1.0f), most_weight = {}, farther_weight = {};
+              vec lows = broadcast(NEVER), highs = broadcast(-NEVER), least_weight = broadcast(1.0f), most_weight = {}, farther_weight = {};
               bool there = true;
               for (int y = 0; y < rows; y++) {
                 if (!(there = s_.row(i, row * CELL + y, x0, light.data(), coc, weight))) break;
@@ -237,28 +256,28 @@ class Composite {
                 }
                 if (n < CELL) coc = cut_coc, weight = weight ? cut_weight : nullptr;
                 for (int x = 0; x < CELL; x += LANES) {
-                  const vec its_coc = load<vec>(coc + x), place = index_.place(its_coc), w = weight ? load<vec>(weight + x) : all(1.0f);
+                  const vec its_coc = load<vec>(coc + x), place = index_.place(its_coc), w = weight ? load<vec>(weight + x) : broadcast(1.0f);
                   const auto weighs = w != vec{};
                   store(places + y * CELL + x, place);
-                  store(shown + y * CELL + x, weighs ? place : all(NEVER));
-                  lows = least(lows, weighs ? place : all(NEVER));
-                  highs = most(highs, weighs ? place : all(-NEVER));
-                  least_weight = least(least_weight, w);
-                  most_weight = most(most_weight, w);
+                  store(shown + y * CELL + x, weighs ? place : broadcast(NEVER));
+                  lows = min(lows, weighs ? place : broadcast(NEVER));
+                  highs = max(highs, weighs ? place : broadcast(-NEVER));
+                  least_weight = min(least_weight, w);
+                  most_weight = max(most_weight, w);
                   float *const own_coc = own_cocs + y * CELL + x, *const own_weight = own_weights + y * CELL + x;
-                  if (i) farther_weight = most(farther_weight, its_coc < load<vec>(own_coc) ? load<vec>(own_weight) : w);
+                  if (i) farther_weight = max(farther_weight, its_coc < load<vec>(own_coc) ? load<vec>(own_weight) : w);
                   if (!i) store(own_coc, its_coc), store(own_weight, w);
                 }
               }
               if (!there) continue;
-              single &= i ? !any_positive(most_weight) : smallest(least_weight) >= 1;
-              if (i) index_.mixed[cell] = largest(farther_weight) > HIDDEN_WEIGHT;
+              single &= i ? !any_positive(most_weight) : reduce_min(least_weight) >= 1;
+              if (i) index_.mixed[cell] = reduce_max(farther_weight) > HIDDEN_WEIGHT;
               uint16_t *intervals = &index_.intervals[i][(size_t)row * CELL * W_ + x0];
               const bool any = any_positive(most_weight);
-              const int first = any ? node_before(smallest(lows)) : 0, last = any ? node_before(largest(highs)) : 0;
+              const int first = any ? node_before(reduce_min(lows)) : 0, last = any ? node_before(reduce_max(highs)) : 0;
               if (first == last) {
                 for (int y = 0; y < rows; y++) std::fill(intervals + (size_t)y * W_, intervals + (size_t)y * W_ + n, (uint16_t)first);
-                if (any) mark(bits, smallest(lows), first), mark(bits, largest(highs), first);
+                if (any) mark(bits, reduce_min(lows), first), mark(bits, reduce_max(highs), first);
                 continue;
               }
               for (int y = 0; y < rows; y++) {
@@ -266,13 +285,13 @@ class Composite {
                 for (int x = 0; x < CELL; x += LANES) {
                   const vec place = load<vec>(places + y * CELL + x);
                   ivec node = ivec{} + first;
-                  for (int k = first + 1; k <= last; k++) node -= place >= all(layers_[k].at);
+                  for (int k = first + 1; k <= last; k++) node -= place >= broadcast(layers_[k].at);
                   store(nodes + x, node);
                 }
                 for (int x = 0; x < n; x++) intervals[(size_t)y * W_ + x] = (uint16_t)nodes[x];
               }
               for (int k = first; k <= std::min(last + 1, N_ - 1); k++) {  // layer k occurs between nodes k - 1 and k + 1
-                const vec before = all(k == first ? -NEVER : layers_[k - 1].at), after = all(k > last || k == N_ - 1 ? NEVER : layers_[k + 1].at);
+                const vec before = broadcast(k == first ? -NEVER : layers_[k - 1].at), after = broadcast(k > last || k == N_ - 1 ? NEVER : layers_[k + 1].at);
                 ivec found = {};
                 for (int j = 0; j < rows * CELL; j += LANES) {
                   const vec place = load<vec>(shown + j);
@@ -341,7 +360,7 @@ class Composite {
         vec most_cover = {};
         for (int e = 0; e < E_; e++)
           for (int i = 0; i < PART; i++)
-            for (int j = 0; j < PART; j += LANES) most_cover = most(most_cover, load<vec>(b.canvas[C_ + e] + (y + i) * TILE + x + j));
+            for (int j = 0; j < PART; j += LANES) most_cover = max(most_cover, load<vec>(b.canvas[C_ + e] + (y + i) * TILE + x + j));
         run.used[(size_t)(tile_y + y) / PART * run.part_columns + (tile_x + x) / PART] = any_positive(most_cover);
       }
   }
@@ -383,7 +402,7 @@ class Composite {
   // The terms of layer k in a window. Adds the weight between node k and the next to `farther`.
   void downsampled_terms(const Run &run, const Downsampled &d, int k, int top, int left, int height, int width, int spare, Scratch &b) {
     const int C = C_;
-    const vec at = all((float)k), before = all((float)(k - 1));
+    const vec at = broadcast((float)k), before = broadcast((float)(k - 1));
     for (int y = spare; y < height - spare; y++) {
       const size_t to = (size_t)y * pitch_;
       const float *node = d.row(0, top + y) + left, *one = d.row(1, top + y) + left, *two = d.row(C + 2, top + y) + left;
@@ -397,12 +416,12 @@ class Composite {
           const vec w = load<vec>(one + x), part = load<vec>(two + x);
           const vec ramp = ahead ? part : vec{}, its_share = behind ? w - part : ramp;
           store(share + x, its_share);
-          some = most(some, its_share);
+          some = max(some, its_share);
           if (!over_) continue;
-          const vec its_normalizer = (n >= at ? w : ramp) + load<vec>(b.farther + to + x), from_one = its_normalizer - all(1.0f);
+          const vec its_normalizer = (n >= at ? w : ramp) + load<vec>(b.farther + to + x), from_one = its_normalizer - 1.0f;
           store(normalizer + x, its_normalizer);
-          more = most(more, its_normalizer - its_share);
-          other = most(other, from_one * from_one - all(EVEN_SQUARED));
+          more = max(more, its_normalizer - its_share);
+          other = max(other, from_one * from_one - EVEN_SQUARED);
         }
         const uint32_t bit = mark(x0);
         occupied |= any_positive(some) ? bit : 0;
@@ -545,11 +564,11 @@ class Composite {
   void row_terms(const Layer &l, int n, const float *const *light, const float *const *place, const float *const *weight, float *const *term) const {
     std::vector<vec> m(s_.count);  // share of each surface
     for (int i = 0; i < n; i += LANES) {
-      vec left = all(1.0f), unknown = left, normalizer = left, share = {};
+      vec left = broadcast(1.0f), unknown = left, normalizer = left, share = {};
       for (int j = 0; j < s_.count; j++) {
         const vec p = load<vec>(place[j] + i), cover = load<vec>(weight[j] + i), h = at_or_behind(l, p, over_);
-        const vec here = cover * eased(least(h / HIDING_SHARE, all(1.0f))), there = 1.0f - here * (1.0f - h);
-        const vec stops = cover * (h - behind(l, p, over_)) / most(there, all(LEAST_PASSING));
+        const vec here = cover * eased(min(h / HIDING_SHARE, broadcast(1.0f))), there = 1.0f - here * (1.0f - h);
+        const vec stops = cover * (h - behind(l, p, over_)) / max(there, broadcast(LEAST_PASSING));
         m[j] = left * stops;
         left *= 1.0f - stops;
         normalizer *= there;
@@ -713,7 +732,7 @@ class Composite {
           const WindowBlock::Surface &of = w.surfaces[j];
           p[j] = load<vec>(b.coc[j] + at + x);
           h[j] = at_or_behind(l, p[j], over_);
-          weight[j] = of.weight ? load<vec>(of.weight + row * of.weight_pitch + x) : all(1.0f);
+          weight[j] = of.weight ? load<vec>(of.weight + row * of.weight_pitch + x) : broadcast(1.0f);
         }
         if (COUNT == 2) add_continuation(p, h, weight);
         for (int j = 0; j < COUNT; j++) normalizer += h[j] * weight[j];
@@ -735,10 +754,10 @@ class Composite {
           b.occupied[y] |= any_positive(share) ? bit : 0;
         }
         if (!over_) continue;
-        const vec from_one = normalizer - all(1.0f);
+        const vec from_one = normalizer - 1.0f;
         store(b.term[C + 1] + at + x, normalizer);
         partial[row] |= any_positive(normalizer - share) ? bit : 0;
-        varying[row] |= any_positive(from_one * from_one - all(EVEN_SQUARED)) ? bit : 0;
+        varying[row] |= any_positive(from_one * from_one - EVEN_SQUARED) ? bit : 0;
       }
     }
   }
@@ -833,9 +852,9 @@ class Composite {
       float *const canvas = b.canvas[C_ + e] + at;
       for (int i = 0; i < STRIP; i += LANES) {
         const vec all_normalizer = load<vec>(normalizer + i), its_share = load<vec>(share + i), missing = lacking(all_normalizer);
-        const vec known = all_normalizer + raise(missing), per_normalizer = all(1.0f) / known, cover = its_share * per_normalizer;
+        const vec known = all_normalizer + raise(missing), per_normalizer = 1.0f / known, cover = its_share * per_normalizer;
         // a layer that covers a pixel fully removes all light behind it, however bright
-        const vec its_left = its_share < known ? most(all(1.0f) - cover, vec{}) : vec{};
+        const vec its_left = its_share < known ? max(1.0f - cover, vec{}) : vec{};
         store(gain + i, per_normalizer);
         store(left + i, its_left);
         float *to = canvas + i / STRIP_COLUMNS * TILE + i % STRIP_COLUMNS;
@@ -875,7 +894,7 @@ class Composite {
         const float *from = &run.canvas[((size_t)c * run.rows + row) * run.columns + first];
         const int inside = std::max(std::min(count, run.columns - 1 - first), 0);
         if (c >= C_) {
-          for (int i = 0; i <= inside; i += LANES) most_cover = most(most_cover, load<vec>(from + i));
+          for (int i = 0; i <= inside; i += LANES) most_cover = max(most_cover, load<vec>(from + i));
         } else if (!any_positive(most_cover)) {
           memset(to, 0, (size_t)channels * pitch * sizeof(float));
           return false;
@@ -919,7 +938,7 @@ class Composite {
         float *canvas = b.canvas[c] + y * TILE;
         for (int x = 0; x < TILE; x += LANES) {
           const vec value = value_at(c, x);
-          const vec left = over_ ? most(all(1.0f) - (c < C_ ? value_at(C_ + e, x) : value), vec{}) : all(1.0f);
+          const vec left = over_ ? max(1.0f - (c < C_ ? value_at(C_ + e, x) : value), vec{}) : broadcast(1.0f);
           store(canvas + x, value + left * load<vec>(canvas + x));
         }
       }
@@ -940,7 +959,7 @@ class Composite {
     for (int y = 0; y < rows; y++) {
       read_row(y0 + y, x0, columns, false, light.data(), place.data(), weight.data(), b);
       for (int x = 0; x < columns; x += LANES) {
-        vec left = all(1.0f), share = {};
+        vec left = broadcast(1.0f), share = {};
         for (int j = 0; j < s_.count; j++) {
           const vec at = load<vec>(place[j] + x), given = load<vec>(weight[j] + x);
           b.missing[j] = 1.0f - counts(given) * at_focus(at);
@@ -948,11 +967,11 @@ class Composite {
           if (s_.independent) left *= 1.0f - given;
         }
         for (int j = 0; j < s_.count; j++) {
-          for (int i = 0; i < s_.count; i++) b.cover[j] *= i == j ? all(1.0f) : b.missing[i];
+          for (int i = 0; i < s_.count; i++) b.cover[j] *= i == j ? broadcast(1.0f) : b.missing[i];
           share += b.cover[j];
         }
         if (!any_positive(share)) continue;
-        const vec through = most(all(1.0f) - share, vec{});
+        const vec through = max(1.0f - share, vec{});
         for (int c = 0; c < C_ + E_; c++) {
           vec sum = c < C_ ? vec{} : share;
           for (int j = 0; c < C_ && j < s_.count; j++) sum += load<vec>(light[j * C_ + c] + x) * b.cover[j];
@@ -1035,7 +1054,7 @@ class Composite {
         float *const to = out_ + at;
         for (int x = 0; x < columns; x += LANES) {
           vec v = load<vec>(canvas + x);
-          if (normalize) v = load<vec>(cover + x) > all(LEAST) ? v / load<vec>(cover + x) : vec{};
+          if (normalize) v = load<vec>(cover + x) > LEAST ? v / load<vec>(cover + x) : vec{};
           if (added) v += load<vec>(added + y * TILE + x);
           if (x + LANES <= columns)
             store(to + x, v);
@@ -1051,10 +1070,10 @@ class Composite {
   }
 
   void composite_over_behind(int y0, int x0, int rows, int columns, Scratch &b) {
-    vec least_cover = all(1.0f);
+    vec least_cover = broadcast(1.0f);
     for (int e = 0; e < E_; e++)
-      for (int i = 0; i < TILE_PIXELS; i += LANES) least_cover = least(least_cover, load<vec>(b.canvas[C_ + e] + i));
-    if (!any_of(least_cover < all(1.0f - COVERED))) return;
+      for (int i = 0; i < TILE_PIXELS; i += LANES) least_cover = min(least_cover, load<vec>(b.canvas[C_ + e] + i));
+    if (!any_of(least_cover < broadcast(1.0f - COVERED))) return;
     const int h = job_.behind_height, w = job_.behind_width;
     int before[TILE];
     float across[TILE];  // fraction of the way to the next sample
@@ -1073,8 +1092,8 @@ class Composite {
         float *canvas = b.canvas[c] + y * TILE;
         const float *upper = &job_.behind[((size_t)c * h + top) * w], *lower = &job_.behind[((size_t)c * h + bottom) * w];
         for (int x = 0; x < columns; x += LANES) {
-          const vec uncovered = all(1.0f) - load<vec>(cover + x), old = load<vec>(canvas + x);
-          const auto is_uncovered = uncovered > all(COVERED);
+          const vec uncovered = 1.0f - load<vec>(cover + x), old = load<vec>(canvas + x);
+          const auto is_uncovered = uncovered > COVERED;
           if (!any_of(is_uncovered)) continue;
           vec above_left, above_right, below_left, below_right;
           for (int i = 0; i < LANES; i++) {

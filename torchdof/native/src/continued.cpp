@@ -7,7 +7,18 @@
 //
 // K_ij is the share of pixel j that is on the surface of pixel i or on a farther one. With all places reversed, the shares
 // are K_ji, so that the gradients of sums over windows are sums over windows again.
-#include "engine.h"
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <vector>
+
+#include "api.h"
+#include "blur_axis.h"
+#include "border.h"
+#include "entry.h"
+#include "light.h"
+#include "memory.h"
+#include "threads.h"
 
 namespace torchdof {
 namespace {

@@ -1,5 +1,14 @@
 // Convolution with one kernel: four rows and two vectors of columns at a time, kept in registers.
-#include "engine.h"
+#include "convolution.h"
+
+#include <algorithm>
+#include <cmath>
+#include <cstring>
+#include <vector>
+
+#include "field_mask.h"
+#include "layers.h"
+#include "simd.h"
 
 namespace torchdof {
 namespace {
@@ -115,12 +124,12 @@ void mask_kernel(const Layer &layer, int colour, const FieldMask &mask, Kernel &
     float *to = masked.taps.data() + column;
     float low = -half, high = half;
     if (layer.spots) mask.rows_of((float)-d, low, high);
-    const int start = (int)std::ceil(clamp(half - high, 0.0f, (float)side)), end = (int)std::floor(clamp(half - low, -1.0f, (float)(side - 1))) + 1;
+    const int start = (int)std::ceil(std::clamp(half - high, 0.0f, (float)side)), end = (int)std::floor(std::clamp(half - low, -1.0f, (float)(side - 1))) + 1;
     for (int y = start; y < end; y += LANES) {
       const int n = std::min(LANES, end - y);
       vec taps = {};
       memcpy(&taps, from + y, n * sizeof(float));
-      taps *= mask.transmittance((float)(half - y) - counting(), all((float)-d));
+      taps *= mask.transmittance((float)(half - y) - iota(), broadcast((float)-d));
       left += taps;
       memcpy(to + y, &taps, n * sizeof(float));
     }

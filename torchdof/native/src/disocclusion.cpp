@@ -1,14 +1,27 @@
 // Disocclusion: fills the surfaces hidden behind a blurred foreground with light and depth of the farthest surfaces
 // around, as described in render/surfaces/disocclusion.py.
-#include "engine.h"
+#include "disocclusion.h"
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <vector>
+
+#include "blocks.h"
+#include "blur_axis.h"
+#include "highlights.h"
+#include "job.h"
+#include "memory.h"
 #include "rules.h"
+#include "simd.h"
+#include "surfaces.h"
 
 namespace torchdof {
 namespace {
 
 constexpr float FALL = constants::disocclusion::FALL;
 constexpr float SURE = constants::disocclusion::SURE;
-constexpr float LEAST_TOTAL = constants::disocclusion::LEAST_TOTAL;
 constexpr float MIXED = constants::disocclusion::MIXED;
 constexpr float HIDING_FROM_PX = constants::disocclusion::HIDING_FROM_PX;
 constexpr int BAND = 8;         // rows of a level computed together
@@ -45,7 +58,7 @@ struct Place {
 };
 
 inline Place place_in(float at, int size) {
-  at = clamp(at, 0.0f, (float)(size - 1));
+  at = std::clamp(at, 0.0f, (float)(size - 1));
   const int before = std::min((int)at, std::max(0, size - 2));
   return {before, at - before};
 }
@@ -212,7 +225,7 @@ class Filling {
       float *coc = out + C * pitch, *weight = coc + pitch;
       for (int x = 0; x < BLOCK; x += LANES) {
         const vec its = load<vec>(b.coc + first + x), mine = load<vec>(coc + x), share = load<vec>(b.weight + first + x);
-        const auto mixed = (share > all(MIXED)) & (its > mine);
+        const auto mixed = (share > MIXED) & (its > mine);
         store(coc + x, mixed ? its : mine);
         store(weight + x, mixed ? share : load<vec>(b.own_weight + first + x));
         for (int c = 0; c < C; c++)
@@ -224,8 +237,8 @@ class Filling {
     if (!bright) return;
     for (int x = 0; x < n; x += LANES) {
       vec peaks = load<vec>(out + x);
-      for (int c = 1; c < C; c++) peaks = most(peaks, load<vec>(out + c * pitch + x));
-      if (!any_of(peaks > all(least_limit))) continue;
+      for (int c = 1; c < C; c++) peaks = max(peaks, load<vec>(out + c * pitch + x));
+      if (!any_of(peaks > least_limit)) continue;
       for (int i = x; i < std::min(x + LANES, n); i++) {
         const float peak = peaks[i - x], limit = peak > least_limit ? threshold_at(job_, y, x0 + i) : peak;
         if (peak > limit)  // a hidden surface next to a highlight is not a highlight
@@ -254,22 +267,22 @@ class Filling {
       };
       read(C);
       vec farthest_coc = child[0];
-      for (int j = 1; j < count; j++) farthest_coc = most(farthest_coc, child[j]);
-      for (int j = 0; j < count; j++) counts[j] = all(1.0f) - is_another_surface(farthest_coc - child[j]);
+      for (int j = 1; j < count; j++) farthest_coc = max(farthest_coc, child[j]);
+      for (int j = 0; j < count; j++) counts[j] = 1.0f - is_another_surface(farthest_coc - child[j]);
       read(C + 1);
       for (int j = 0; j < count; j++) {
         const bool half_row = rows_count == 3 && j / COLUMNS != 1, half_column = COLUMNS == 3 && j % COLUMNS != 1;
         counts[j] *= 0.25f * (half_row ? 0.5f : 1.0f) * (half_column ? 0.5f : 1.0f) * child[j];
         total += counts[j];
       }
-      const vec each = all(1.0f) / most(total, all(LEAST_TOTAL));
+      const vec each = 1.0f / max(total, broadcast(LEAST_TOTAL));
       for (int i = 0; i < n; i++) store(out + (i + 1) * stride_ - F8, f8{});  // padding
       for (int k = 0; k <= C; k++) {
         read(k);
         vec sum = {};
         for (int j = 0; j < count; j++) sum += child[j] * counts[j];
         sum *= each;
-        put(k, k < C ? sum : total > vec{} ? sum : all(-NEVER));
+        put(k, k < C ? sum : total > vec{} ? sum : broadcast(-NEVER));
       }
       put(C + 1, total);
     }
@@ -472,7 +485,7 @@ class Filling {
       for (int row = first_rows[i]; row <= bottom; row++, line += planes * CELL)
         for (int side = 0; side < 2; side++)
           for (int k = 0; k < planes; k++)
-            for (int v = 0; v < VECTORS; v++) *out++ = pick(line + k * CELL, samples[side][v]);
+            for (int v = 0; v < VECTORS; v++) *out++ = lookup(line + k * CELL, samples[side][v]);
     }
     for (int y = 0; y < rows; y++) {
       const int within = (y0 + y) % BLOCK * BLOCK + x0 % BLOCK;
@@ -480,9 +493,9 @@ class Filling {
       float cut[CELL] = {};
       if (columns < CELL) here_of = (const float *)memcpy(cut, here_of, columns * sizeof(float));
       for (int v = 0; v < VECTORS; v++) {
-        const vec here = load<vec>(here_of + v * LANES), size = most(here, -here);
-        ivec wanted = size > all(HIDING_FROM_PX);
-        if (s_.has_block(which)) wanted &= load<vec>(s_.block(which).weight + within + v * LANES) < all(0.5f * HIDDEN_WEIGHT);
+        const vec here = load<vec>(here_of + v * LANES), size = max(here, -here);
+        ivec wanted = size > HIDING_FROM_PX;
+        if (s_.has_block(which)) wanted &= load<vec>(s_.block(which).weight + within + v * LANES) < broadcast(0.5f * HIDDEN_WEIGHT);
         if (!any_of(wanted)) continue;
         const vec end = end_of_surface(here);
         vec total = {};
@@ -497,18 +510,18 @@ class Filling {
           corners[3] = corners[2] + beside;
           vec right, weight = {}, counts[4];
           for (int x = 0; x < LANES; x++) right[x] = xs[std::min(v * LANES + x, columns - 1)].part;
-          const vec left = all(1.0f) - right, shares[4] = {left * (1.0f - row.part), right * (1.0f - row.part), left * row.part, right * row.part};
+          const vec left = 1.0f - right, shares[4] = {left * (1.0f - row.part), right * (1.0f - row.part), left * row.part, right * row.part};
           for (int k = 0; k < 4; k++) {
             const vec farther = is_another_surface(corners[k][C * VECTORS] - end);
             weight += counts[k] = shares[k] * corners[k][(C + 1) * VECTORS] * farther;
           }
           const vec level_weight = is_read(size, level.least_px);
-          const ivec is_seen = (weight > all(LEAST_SEEN)) & (level_weight > vec{});
+          const ivec is_seen = (weight > LEAST_SEEN) & (level_weight > vec{});
           if (!any_of(is_seen)) continue;
-          const vec voted = level.vote > 0 ? level.vote * least(weight * (1.0f / SURE), all(1.0f)) : weight;
+          const vec voted = level.vote > 0 ? level.vote * min(weight * (1.0f / SURE), broadcast(1.0f)) : weight;
           const vec vote = is_seen ? level_weight * voted : vec{};
           total += vote;
-          const vec part = vote / most(total, all(LEAST_TOTAL)), each = all(1.0f) / most(weight, all(LEAST_SEEN));
+          const vec part = vote / max(total, broadcast(LEAST_TOTAL)), each = 1.0f / max(weight, broadcast(LEAST_SEEN));
           for (vec &count : counts) count *= each;
           for (int k = 0; k <= C; k++) {
             const size_t plane = (size_t)k * VECTORS;
@@ -521,11 +534,11 @@ class Filling {
         // replaces a second surface to which matting gave a small weight
         const Block b = s_.make_block(which);
         const size_t at = within + v * LANES;
-        const vec mixed = load<vec>(b.weight + at), hidden = least(total * (1.0f / CERTAIN), all(1.0f)) * (2.0f * mixed - HIDDEN_WEIGHT);
+        const vec mixed = load<vec>(b.weight + at), hidden = min(total * (1.0f / CERTAIN), broadcast(1.0f)) * (2.0f * mixed - HIDDEN_WEIGHT);
         auto replace = [&](float *other, vec hidden_one) { store(other, wanted ? hidden_one : load<vec>(other)); };
         for (int c = 0; c < C; c++) replace(b.other + c * BLOCK_PIXELS + at, mean[c]);
         replace(b.coc + at, mean[C]);
-        vec valid = all(1.0f);
+        vec valid = broadcast(1.0f);
         for (int x = 0; s_.valid && x < std::min(LANES, columns - v * LANES); x++) valid[x] = s_.valid[(size_t)(y0 + y) * W + x0 + v * LANES + x];
         store(b.weight + at, wanted ? hidden * valid : mixed);
       }

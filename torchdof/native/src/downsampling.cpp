@@ -4,8 +4,21 @@
 // second). The means of weight w and light, and of w t and light t, over the pixels between each two nodes are
 // therefore enough: the layer at the first node takes mean(w) - mean(w t), the one at the second takes mean(w t).
 // In the code, `sums` are without t, and `sums_behind` with t: of the parts that lie behind the first node.
-#include "engine.h"
+#include "downsampling.h"
+
+#include <algorithm>
+#include <cstdint>
+#include <cstring>
+#include <vector>
+
+#include "blocks.h"
+#include "border.h"
+#include "job.h"
+#include "layers.h"
+#include "memory.h"
 #include "rules.h"
+#include "simd.h"
+#include "surfaces.h"
 
 namespace torchdof {
 
@@ -116,7 +129,7 @@ class Downsampling {
           halves of_row;
           memcpy(&of_row, intervals + x, sizeof(of_row));
           store(interval_[there] + i, __builtin_convertvector(of_row, ivec));
-          store(weight_[there] + i, weight ? load<vec>(weight + y * BLOCK + x) : all(1.0f));
+          store(weight_[there] + i, weight ? load<vec>(weight + y * BLOCK + x) : broadcast(1.0f));
           store(coc_[there] + i, load<vec>(coc + x));
         }
     }
@@ -211,7 +224,7 @@ class Downsampling {
         const int i = y * WIDTH + p * LANES;
         place[y][p] = index_.place(load<vec>(coc_[surface] + i));
         interval[y][p] = load<vec>(weight_[surface] + i) != vec{} ? load<ivec>(interval_[surface] + i) : ivec{} + DONE;
-        last = most(last, interval[y][p]);
+        last = max(last, interval[y][p]);
       }
     for (;;) {
       int k = DONE;
@@ -232,7 +245,7 @@ class Downsampling {
           }
           sums[p] += share[y][p];
           interval[y][p] = its ? ivec{} + DONE : interval[y][p];
-          last = most(last, interval[y][p]);
+          last = max(last, interval[y][p]);
         }
       if (!to_.needed(k)) continue;
       const size_t start = cell_sums_of(to_.stands_for[k], COUNT);

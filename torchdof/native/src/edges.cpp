@@ -2,10 +2,20 @@
 //
 // The frame is processed in tiles of AREA x AREA pixels, and within a tile only where the map changes. Each tile is
 // copied with a margin, padded beyond the frame with the nearest border pixel, so that loops run in whole vectors.
+#include <algorithm>
 #include <array>
+#include <cmath>
+#include <cstdint>
+#include <cstdlib>
+#include <cstring>
+#include <vector>
 
+#include "api.h"
 #include "constants/edges.h"
-#include "engine.h"
+#include "entry.h"
+#include "memory.h"
+#include "simd.h"
+#include "threads.h"
 
 namespace torchdof {
 namespace {
@@ -165,11 +175,11 @@ void max_filter(const Grid &in, const Grid &out, const Grid &rows, const Part &p
   constexpr int TAPS = 2 * REACH_ + 1, RUN = (TAPS + 2) / 3, LAST = TAPS - RUN, MIDDLE = LAST / 2;
   const auto run = [](const float *from, int stride) {
     vec high = load<vec>(from);
-    for (int d = 1; d < RUN; d++) high = most(high, load<vec>(from + d * stride));
+    for (int d = 1; d < RUN; d++) high = max(high, load<vec>(from + d * stride));
     return high;
   };
   const auto three = [](const float *from, int stride) {
-    return most(load<vec>(from), most(load<vec>(from + MIDDLE * stride), load<vec>(from + LAST * stride)));
+    return max(load<vec>(from), max(load<vec>(from + MIDDLE * stride), load<vec>(from + LAST * stride)));
   };
   for (int y = part.y0 - REACH_; y < part.bottom() + REACH_; y++) {
     for (int x = part.x0; RUN > 1 && x < part.right() + LAST; x += LANES) store(rows.at(y, x), run(in.at(y, x - REACH_), 1));
@@ -181,8 +191,8 @@ void max_filter(const Grid &in, const Grid &out, const Grid &rows, const Part &p
 
 // Maximum over 3 x 3 values around each value of a vector.
 inline vec max_3x3(const float *from, int pitch) {
-  vec high = most(load<vec>(from), most(load<vec>(from - 1), load<vec>(from + 1)));
-  for (const float *row : {from - pitch, from + pitch}) high = most(high, most(load<vec>(row), most(load<vec>(row - 1), load<vec>(row + 1))));
+  vec high = max(load<vec>(from), max(load<vec>(from - 1), load<vec>(from + 1)));
+  for (const float *row : {from - pitch, from + pitch}) high = max(high, max(load<vec>(row), max(load<vec>(row - 1), load<vec>(row + 1))));
   return high;
 }
 
@@ -536,10 +546,10 @@ class Repair {
       vec row{};
       for (int x = 0; x < around.width; x += LANES) {
         const vec v = load<vec>(of_row + x);
-        row = most(v, row);
-        store(of_columns + x, most(v, load<vec>(of_columns + x)));
+        row = max(v, row);
+        store(of_columns + x, max(v, load<vec>(of_columns + x)));
       }
-      if (largest(row) > change) {
+      if (reduce_max(row) > change) {
         top = std::min(top, y);
         bottom = y + 1;
       }
@@ -567,23 +577,23 @@ class Repair {
     fetch(map_.nearness, raw, [this](float v) { return std::fabs(v) <= LARGEST ? sign_ * v : NAN; });
     each_vector(whole, [&](int y, int x) {
       const vec v = load<vec>(raw.at(y, x));
-      const auto is_valid = size_of(v) <= all(LARGEST);
-      store(up.at(y, x), is_valid ? v : all(-NONE));
-      store(down.at(y, x), is_valid ? -v : all(-NONE));
+      const auto is_valid = abs(v) <= LARGEST;
+      store(up.at(y, x), is_valid ? v : broadcast(-NONE));
+      store(down.at(y, x), is_valid ? -v : broadcast(-NONE));
     });
     const auto step_at = [&](int y, int x) {
-      if (!map_.steps) return all(step(0));
+      if (!map_.steps) return broadcast(step(0));
       vec steps;
       const float *row = map_.steps + (size_t)std::min(std::max(y, 0), height_ - 1) * width_;
       for (int i = 0; i < LANES; i++) steps[i] = row[std::min(std::max(x + i, 0), width_ - 1)];
-      return most(steps, all(noise_step_));
+      return max(steps, broadcast(noise_step_));
     };
     slopes(raw, slope, jump, is_wide ? ramps.grown(FLAT_REACH + 2) : beside);
     ramp.clear();
     // ramps within RINGS pixels affect the inner part
     const auto any_beside = [&](const auto &is) {
       vec any{};
-      each_vector(beside, [&](int y, int x) { any = is(y, x) ? all(1.0f) : any; });
+      each_vector(beside, [&](int y, int x) { any = is(y, x) ? broadcast(1.0f) : any; });
       return any_positive(any);
     };
     const auto is_steep = [&](int y, int x) { return load<vec>(slope.at(y, x)) > 0.1f * step_at(y, x); };
@@ -593,8 +603,8 @@ class Repair {
       max_filter<REACH>(down, low, rows, ramps);
       each_vector(ramps, [&](int y, int x) {
         const vec span = load<vec>(high.at(y, x)) + load<vec>(low.at(y, x));
-        const auto is_candidate = is_steep(y, x) & (load<vec>(slope.at(y, x)) > SHALLOW * span) & (span > step_at(y, x)) & (size_of(load<vec>(raw.at(y, x))) <= all(LARGEST));
-        store(ramp.at(y, x), is_candidate ? all(1.0f) : vec{});
+        const auto is_candidate = is_steep(y, x) & (load<vec>(slope.at(y, x)) > SHALLOW * span) & (span > step_at(y, x)) & (abs(load<vec>(raw.at(y, x))) <= LARGEST);
+        store(ramp.at(y, x), is_candidate ? broadcast(1.0f) : vec{});
       });
     }
     if (any_beside(is_ramp)) {
@@ -603,7 +613,7 @@ class Repair {
       each_vector(beside, [&](int y, int x) {
         const vec near = load<vec>(high.at(y, x)), far = load<vec>(low.at(y, x));
         const auto is_kept = is_ramp(y, x) & (near + far > step_at(y, x));
-        store(ramp.at(y, x), is_kept ? all(1.0f) : vec{});
+        store(ramp.at(y, x), is_kept ? broadcast(1.0f) : vec{});
         store(up.at(y, x), is_kept ? near : load<vec>(up.at(y, x)));
         store(down.at(y, x), is_kept ? far : load<vec>(down.at(y, x)));
       });
@@ -620,7 +630,7 @@ class Repair {
     const Part means = inner.grown(2);  // over 5 x 5 pixels; their differences give the direction of the step
     each_vector(inner.grown(4), [&](int y, int x) {
       const vec v = load<vec>(raw.at(y, x));
-      store(slope.at(y, x), size_of(v) <= all(FINITE) ? v : vec{});
+      store(slope.at(y, x), abs(v) <= FINITE ? v : vec{});
     });
     sums<2>(slope, high, rows, means, 1.0f / 25.0f);
 
@@ -629,36 +639,36 @@ class Repair {
       const size_t row = (size_t)y * width_;
       const bool is_own = y >= own.y0 && y < own.bottom();
       for (int x = inner.x0, k = 0; x < inner.right(); x += LANES, k += LANES) {
-        const vec s = step_at(y, x), v = load<vec>(raw.at(y, x)), is_ramp = load<vec>(ramp.at(y, x)), none = {}, one = all(1.0f);
-        const auto is_valid = size_of(v) <= all(LARGEST);
+        const vec s = step_at(y, x), v = load<vec>(raw.at(y, x)), is_ramp = load<vec>(ramp.at(y, x)), none = {}, one = broadcast(1.0f);
+        const auto is_valid = abs(v) <= LARGEST;
         vec near = load<vec>(nears[RINGS - 1].at(y, x)), far = load<vec>(fars[RINGS - 1].at(y, x)), unsure = {};
         if (!any_of((near + far > s) | (is_ramp > none))) {  // no step is large enough
-          store(marks_of_row + k, is_valid ? none : all((float)UNSURE * (RINGS + 1)));
+          store(marks_of_row + k, is_valid ? none : broadcast((float)UNSURE * (RINGS + 1)));
           continue;
         }
-        const vec least_gap = most(NEAREST * (near + far), s);
+        const vec least_gap = max(NEAREST * (near + far), s);
         for (int r = RINGS - 1; r >= 0; r--) {
           const vec n = load<vec>(nears[r].at(y, x)), f = load<vec>(fars[r].at(y, x)), gap = n + f;
           const auto is_step = (gap > least_gap) & (load<vec>(jumps[r].at(y, x)) > ABRUPT * gap);
           near = is_step ? n : near;
           far = is_step ? f : far;
-          unsure = is_step ? all((float)(RINGS - r)) : unsure;
+          unsure = is_step ? broadcast((float)(RINGS - r)) : unsure;
         }
         near = is_ramp > none ? load<vec>(up.at(y, x)) : near;
         far = is_ramp > none ? -load<vec>(down.at(y, x)) : -far;
         const auto is_edge = (is_ramp + unsure > none) & (near - far > s) & is_valid;
         const vec is_near = 2.0f * v > near + far ? one : none;
-        const vec mark = (is_edge ? all((float)EDGE) : none) + is_near * (float)NEAR + is_ramp * (float)RAMP;
-        store(marks_of_row + k, (is_edge | (is_ramp > none) ? mark : none) + (float)UNSURE * (is_valid & (is_ramp <= none) ? unsure : all((float)(RINGS + 1))));
+        const vec mark = (is_edge ? broadcast((float)EDGE) : none) + is_near * (float)NEAR + is_ramp * (float)RAMP;
+        store(marks_of_row + k, (is_edge | (is_ramp > none) ? mark : none) + (float)UNSURE * (is_valid & (is_ramp <= none) ? unsure : broadcast((float)(RINGS + 1))));
         const int first = std::max(0, own.x0 - x), last = std::min(LANES, std::min(inner.right(), own.right()) - x);
-        int edges_here = is_own && first < last ? bits(is_edge) & ((1 << last) - (1 << first)) : 0;
+        int edges_here = is_own && first < last ? movemask(is_edge) & ((1 << last) - (1 << first)) : 0;
         if (!edges_here) continue;
-        const vec gap = most(near - far, all(1e-12f)), level = (v - far) / gap;
+        const vec gap = max(near - far, broadcast(1e-12f)), level = (v - far) / gap;
         const vec right = load<vec>(high.at(y, x + 2)) - load<vec>(high.at(y, x - 2)), below = load<vec>(high.at(y + 2, x)) - load<vec>(high.at(y - 2, x));
-        const vec across = size_of(right) > size_of(below) + TIE * gap ? (right > none ? one : -one) : none;
-        const vec along = size_of(below) > size_of(right) + TIE * gap ? (below > none ? one : -one) : none;
-        const vec on_ramp = 2.0f * RINGS + convert(convert(least(most(level * (float)LEVELS, none), all(LEVELS - 1.0f))));
-        const vec place = is_ramp > none ? on_ramp : (level > 0.5f ? all((float)RINGS) : none) + (float)RINGS - unsure;
+        const vec across = abs(right) > abs(below) + TIE * gap ? (right > none ? one : -one) : none;
+        const vec along = abs(below) > abs(right) + TIE * gap ? (below > none ? one : -one) : none;
+        const vec on_ramp = 2.0f * RINGS + convert(convert(min(max(level * (float)LEVELS, none), broadcast(LEVELS - 1.0f))));
+        const vec place = is_ramp > none ? on_ramp : (level > 0.5f ? broadcast((float)RINGS) : none) + (float)RINGS - unsure;
         float nearest[LANES], farthest[LANES];
         int32_t kinds[LANES], sides[LANES];
         store(nearest, near);
@@ -691,16 +701,16 @@ class Repair {
 
   // slope: the smaller change to both neighbours if these have one sign, else 0. jump: the larger change minus the slope.
   void slopes(const Grid &raw, const Grid &slope, const Grid &jump, const Part &part) const {
-    const auto known = [](vec change) { return size_of(change) <= all(FINITE) ? change : vec{}; };
+    const auto known = [](vec change) { return abs(change) <= FINITE ? change : vec{}; };
     each_vector(part, [&](int y, int x) {
       const float *at = raw.at(y, x);
       const vec here = load<vec>(at);
       const vec x0 = known(here - load<vec>(at - 1)), x1 = known(load<vec>(at + 1) - here);
       const vec y0 = known(here - load<vec>(at - raw.pitch)), y1 = known(load<vec>(at + raw.pitch) - here);
-      const vec ax0 = size_of(x0), ax1 = size_of(x1), ay0 = size_of(y0), ay1 = size_of(y1);
-      const vec sx = x0 * x1 > vec{} ? least(ax0, ax1) : vec{}, sy = y0 * y1 > vec{} ? least(ay0, ay1) : vec{};
-      store(slope.at(y, x), most(sx, sy));
-      store(jump.at(y, x), most(most(ax0, ax1) - sx, most(ay0, ay1) - sy));
+      const vec ax0 = abs(x0), ax1 = abs(x1), ay0 = abs(y0), ay1 = abs(y1);
+      const vec sx = x0 * x1 > vec{} ? min(ax0, ax1) : vec{}, sy = y0 * y1 > vec{} ? min(ay0, ay1) : vec{};
+      store(slope.at(y, x), max(sx, sy));
+      store(jump.at(y, x), max(max(ax0, ax1) - sx, max(ay0, ay1) - sy));
     });
   }
 
@@ -720,12 +730,12 @@ class Repair {
     std::vector<Piece> pieces;
     for (int y = inside.y0; y < inside.bottom(); y++)
       for (int x = ramps.x0; x < ramps.right(); x += LANES) {
-        vec is_ramp = (load<vec>(ramp.at(y, x)) > vec{}) & (-load<vec>(low.at(y, x)) < FLAT * load<vec>(slope.at(y, x))) ? all(1.0f) : vec{};
+        vec is_ramp = (load<vec>(ramp.at(y, x)) > vec{}) & (-load<vec>(low.at(y, x)) < FLAT * load<vec>(slope.at(y, x))) ? broadcast(1.0f) : vec{};
         if (x < inside.x0 || x + LANES > inside.right())
           for (int i = 0; i < LANES; i++)
             if (x + i < inside.x0 || x + i >= inside.right()) is_ramp[i] = 0;
         store(ramp.at(y, x), is_ramp);
-        if (largest(is_ramp) > 0) pieces.push_back(Piece{y, x, is_ramp, is_ramp});
+        if (reduce_max(is_ramp) > 0) pieces.push_back(Piece{y, x, is_ramp, is_ramp});
       }
     for (int y = ramps.y0; y < ramps.bottom(); y++) {
       if (y < inside.y0 || y >= inside.bottom()) std::fill(ramp.at(y, ramps.x0), ramp.at(y, ramps.x0) + ramps.width, 0.0f);
@@ -738,15 +748,15 @@ class Repair {
       memcpy(high.at(y, ramps.x0 - 1), up.at(y, ramps.x0 - 1), (ramps.width + 2) * sizeof(float));
       memcpy(low.at(y, ramps.x0 - 1), down.at(y, ramps.x0 - 1), (ramps.width + 2) * sizeof(float));
     }
-    vec changed = all(1.0f);
-    for (int round = 0; round < RAMP_REACH && largest(changed) > 0; round++) {
+    vec changed = broadcast(1.0f);
+    for (int round = 0; round < RAMP_REACH && reduce_max(changed) > 0; round++) {
       changed = vec{};
       for (Piece &b : pieces) {
         const vec near = load<vec>(high.at(b.y, b.x)), far = load<vec>(low.at(b.y, b.x));
         const auto is_ramp = load<vec>(ramp.at(b.y, b.x)) > vec{};
         b.near = is_ramp ? max_3x3(high.at(b.y, b.x), high.pitch) : near;
         b.far = is_ramp ? max_3x3(low.at(b.y, b.x), low.pitch) : far;
-        changed = (b.near > near) | (b.far > far) ? all(1.0f) : changed;
+        changed = (b.near > near) | (b.far > far) ? broadcast(1.0f) : changed;
       }
       for (const Piece &b : pieces) {
         store(high.at(b.y, b.x), b.near);
@@ -792,19 +802,19 @@ class Repair {
     fetch(map_.nearness, given, [this](float v) { return sign_ * valid(v); });
     fetch(marks_.data(), witness, [](uint8_t marks) { return (float)(marks / UNSURE); });
     float *sure = witness.at(around.y0, around.x0);
-    for (size_t i = 0; i < witness.size; i += LANES) store(sure + i, pick(SURE_OF, convert(load<vec>(sure + i))));
+    for (size_t i = 0; i < witness.size; i += LANES) store(sure + i, lookup(SURE_OF, convert(load<vec>(sure + i))));
     std::vector<vec> many(C ? 0 : count);
     std::vector<float> of_lanes((count + channels) * LANES);  // of LANES pixels: totals, own colours
     struct Window {
       vec weights[2][WINDOW], values[WINDOW], apart[WINDOW];
     } windows[LANES];
-    const vec none = {}, one = all(1.0f);
+    const vec none = {}, one = broadcast(1.0f);
     const auto of = [&](int n) { return load<vec>(&of_lanes[n * LANES]); };
     each_edge(group, [&](size_t k, const Edge &edge, int y, int x) {
       const int lane = (int)(k % LANES);
       Window &window = windows[lane];
       const float near = edge.near, far = edge.far;
-      const vec most_difference = all(0.25f * std::max(near - far, 1e-12f));
+      const vec most_difference = broadcast(0.25f * std::max(near - far, 1e-12f));
       vec few[C ? 4 + 2 * C : 1];
       // of both surfaces: weights, squared colour differences, colour differences of each channel
       vec *sums = C ? few : many.data();
@@ -814,7 +824,7 @@ class Repair {
       for (int c = 0; c < channels; c++) own[c * LANES] = colour_at[c * colour.size + REACH * colour.pitch + REACH];
       each_of_window([&](int n, const auto &take) {
         const vec value = take(given_at, given.pitch), weight = load<vec>(falloff + n * LANES) * take(witness_at, given.pitch), off = value - near;
-        const vec w[2] = {size_of(off) < most_difference ? weight : none, size_of(value - far) < most_difference ? weight : none};
+        const vec w[2] = {abs(off) < most_difference ? weight : none, abs(value - far) < most_difference ? weight : none};
         vec apart = none;  // squared colour difference
         for (int c = 0; c < channels; c++) {
           const vec d = take(colour_at + c * colour.size, given.pitch) - own[c * LANES];
@@ -829,7 +839,7 @@ class Repair {
         window.values[n] = off;
         window.apart[n] = apart;
       });
-      for (int n = 0; n < count; n++) of_lanes[n * LANES + lane] = sum(sums[n]);
+      for (int n = 0; n < count; n++) of_lanes[n * LANES + lane] = reduce_add(sums[n]);
       if (lane < LANES - 1 && k + 1 < group.edges.size()) return;
 
       // LANES pixels at once
@@ -845,12 +855,12 @@ class Repair {
         noise += both * both;
       }
       vec spread = COLOUR_NOISE * noise + 1e-12f;
-      for (int side = 0; side < 2; side++) spread += 0.5f * most(of(2 + side) * per_total[side] - from_mean[side], none);
+      for (int side = 0; side < 2; side++) spread += 0.5f * max(of(2 + side) * per_total[side] - from_mean[side], none);
       const vec per_light = 1.0f / (SIMILAR * square + 1e-12f), per_spread = 1.0f / (SPREAD * spread);
       const auto is_known = (of(0) > 1e-3f) & (of(1) > 1e-3f);  // else the neighbours decide
-      const vec reliability = is_known ? most(contrast / (contrast + 0.5f * spread) - 0.1f, none) / 0.9f : one;
-      const vec share = most(least(along / most(contrast, all(1e-12f)), one), none);
-      const vec unmixed = 1.0f + most(from_mean[1] - share * (2.0f * along - share * contrast), none) / spread;
+      const vec reliability = is_known ? max(contrast / (contrast + 0.5f * spread) - 0.1f, none) / 0.9f : one;
+      const vec share = max(min(along / max(contrast, broadcast(1e-12f)), one), none);
+      const vec unmixed = 1.0f + max(from_mean[1] - share * (2.0f * along - share * contrast), none) / spread;
       const vec mixed = wants_surfaces && map_.of_coc ? MIXTURE / (unmixed * unmixed) : none;
       float likely[2][LANES], surfaces[2][LANES], blurs[LANES], *around = group.around[k / LANES].alike[0];
       for (int l = 0; l <= lane; l++) {
@@ -871,19 +881,19 @@ class Repair {
         }
         blurs[l] = more_blurred(edge);
         for (int side = 0; side < 2; side++) {
-          likely[side][l] = sum(parts[side]);
-          surfaces[side][l] = edge.near + sum(parts[4 + side]) / std::max(sum(parts[2 + side]), 1e-12f);
+          likely[side][l] = reduce_add(parts[side]);
+          surfaces[side][l] = edge.near + reduce_add(parts[4 + side]) / std::max(reduce_add(parts[2 + side]), 1e-12f);
         }
       }
       for (int n = 0; n < 8; n++) store(around + n * LANES, 1.0f / (1.0f + load<vec>(around + n * LANES) * per_light));
       vec likelihood[2];
       for (int side = 0; side < 2; side++) likelihood[side] = load<vec>(likely[side]) * per_total[side] + 1e-9f;
       likelihood[0] += mixed * load<vec>(blurs);
-      const vec likeliest = is_known ? least(most(likelihood[0], likelihood[1]) / LIKELY, one) : one;
-      const vec odds = likelihood[0] / likelihood[1], clear = least(least(of(0), of(1)) / (wants_surfaces ? CLEAR : CLEAR_IN_PRIOR), one);
+      const vec likeliest = is_known ? min(max(likelihood[0], likelihood[1]) / LIKELY, one) : one;
+      const vec odds = likelihood[0] / likelihood[1], clear = min(min(of(0), of(1)) / (wants_surfaces ? CLEAR : CLEAR_IN_PRIOR), one);
       for (int l = 0; l <= lane; l++) {
         const Edge &edge = group.edges[k - lane + l];
-        score_[edge.i] = is_known[l] ? clamp(std::log(odds[l]), -8.0f, 8.0f) * (marks_[edge.i] & RAMP ? 1.0f : clear[l]) : 0.0f;
+        score_[edge.i] = is_known[l] ? std::clamp(std::log(odds[l]), -8.0f, 8.0f) * (marks_[edge.i] & RAMP ? 1.0f : clear[l]) : 0.0f;
         evidence_[edge.i] = likeliest[l];
         group.judged[k - lane + l] = {0.0f, reliability[l], is_known[l] ? surfaces[0][l] : edge.near, is_known[l] ? surfaces[1][l] : edge.far};
       }
@@ -906,17 +916,17 @@ class Repair {
         if (lane < LANES - 1 && k + 1 < group.edges.size()) return;
         const float *around = group.around[k / LANES].alike[0];
         const vec none = {};
-        vec total = all(1.0f), score = load<vec>(beside[8]), strongest = size_of(score);
+        vec total = broadcast(1.0f), score = load<vec>(beside[8]), strongest = abs(score);
         for (int n = 0; n < 8; n++) {
           const vec other = load<vec>(beside[n]), alike = other < NO_SCORE ? load<vec>(around + n * LANES) : none;
           total += alike;
           score += alike * other;
-          strongest = most(strongest, other < NO_SCORE ? size_of(other) : none);
+          strongest = max(strongest, other < NO_SCORE ? abs(other) : none);
         }
         score /= total;
         for (int l = 0; l <= lane; l++) {
           Judgement &judged = group.judged[k - lane + l];
-          judged.score = clamp(sharpness_ * judged.reliability * score[l], -6.0f, 6.0f);
+          judged.score = std::clamp(sharpness_ * judged.reliability * score[l], -6.0f, 6.0f);
           float &evidence = evidence_[group.edges[k - lane + l].i];
           evidence = std::max(clamp01(2.0f * judged.reliability * strongest[l] - 1.0f), evidence);
         }
@@ -1000,7 +1010,7 @@ class Repair {
       for (int round = 0; round < ROUNDS; round++) {
         const float odds = (1.0f - share[g]) / share[g];
         const double found = sum_of(g * together, [&](vec weight, vec other) { return weight / (1.0f + odds * other); });
-        share[g] = clamp((float)((found + PRIOR_COUNT * assumed[g]) / (total + PRIOR_COUNT)), 0.005f, 0.995f);
+        share[g] = std::clamp((float)((found + PRIOR_COUNT * assumed[g]) / (total + PRIOR_COUNT)), 0.005f, 0.995f);
       }
     }
     return share;
@@ -1009,7 +1019,7 @@ class Repair {
   // Standard deviation, in pixels, of the blur that turned steps into ramps.
   float blur() const {
     const double width = CLIMBED * found_.middles / std::max(found_.climbed, 1e-12);
-    return clamp((float)std::sqrt(std::max(width * width - PIXEL, 0.0)), LEAST_BLUR_PX, MOST_BLUR_PX);
+    return std::clamp((float)std::sqrt(std::max(width * width - PIXEL, 0.0)), LEAST_BLUR_PX, MOST_BLUR_PX);
   }
 
   // Decides which surface pixels show, and moves them to its nearness; on ramps in proportion to the evidence. Returns the
@@ -1082,13 +1092,13 @@ class Repair {
       fetch(evidence_.data(), up, [this](float v) { return std::fabs(v) <= LARGEST ? sign_ * v : -NONE; });
       fetch(evidence_.data(), down, [this](float v) { return std::fabs(v) <= LARGEST ? -sign_ * v : -NONE; });
       for (const Grid *values : {&up, &down}) spread(*values, 3, true);
-      vec widest = all(-NONE);
+      vec widest = broadcast(-NONE);
       each_vector(part, [&](int y, int x) {
         const vec here = -load<vec>(up.at(y, x)) - load<vec>(down.at(y, x));
         store(span.at(y, x), here);
-        widest = most(widest, here);
+        widest = max(widest, here);
       });
-      if (!map_.steps && !(largest(widest) > step(0))) return;
+      if (!map_.steps && !(reduce_max(widest) > step(0))) return;
       for (const Grid *values : {&up, &down}) {  // the closed opening of -up and of up
         spread(*values, 2, false);
         spread(*values, 1, true);
@@ -1099,7 +1109,7 @@ class Repair {
           const size_t i = (size_t)y * width_ + x;
           const float own = sign_ * map_.out[i], gap = *span.at(y, x), ends[2] = {-*up.at(y, x), *down.at(y, x)};
           if (!(std::fabs(own) <= LARGEST && gap > step(i))) continue;
-          const float moved = clamp(own, std::min(ends[0], ends[1]), std::max(ends[0], ends[1])) - own;
+          const float moved = std::clamp(own, std::min(ends[0], ends[1]), std::max(ends[0], ends[1])) - own;
           map_.out[i] = sign_ * (own + moved * clamp01(2.0f - std::fabs(moved) / (OVERSHOOT * gap)));
         }
     });
@@ -1136,12 +1146,12 @@ class Repair {
         of_covers[i][2] += wx * cy;
       }
     });
-    const float mean_y = sum(of_y[0]), yy = std::max(sum(of_y[1]) - mean_y * mean_y, 0.0f);
+    const float mean_y = reduce_add(of_y[0]), yy = std::max(reduce_add(of_y[1]) - mean_y * mean_y, 0.0f);
     float mean_x[2], of_x[2], both[2], explained[2];
     for (int i = 0; i < 2; i++) {
-      mean_x[i] = sum(of_covers[i][0]);
-      of_x[i] = std::max(sum(of_covers[i][1]) - mean_x[i] * mean_x[i], 0.0f);
-      both[i] = std::max(sum(of_covers[i][2]) - mean_x[i] * mean_y, 0.0f);
+      mean_x[i] = reduce_add(of_covers[i][0]);
+      of_x[i] = std::max(reduce_add(of_covers[i][1]) - mean_x[i] * mean_x[i], 0.0f);
+      both[i] = std::max(reduce_add(of_covers[i][2]) - mean_x[i] * mean_y, 0.0f);
       explained[i] = both[i] * both[i] / std::max(of_x[i] * yy, 1e-12f);
     }
     const float b = both[0] / std::max(of_x[0], 1e-9f), better = clamp01((explained[0] - explained[1]) / std::max(BETTER * (1.0f - explained[1]), 1e-6f));
@@ -1158,12 +1168,12 @@ class Repair {
       const Part &inner = all_parts[g].part, part = in_frame(inner.grown(LAMP_REACH));
       const Grid near(part.grown(REACH));
       fetch(map_.nearness, near, [this](float v) { return sign_ * valid(v); });
-      vec high = all(-NONE), low = all(NONE);
+      vec high = broadcast(-NONE), low = broadcast(NONE);
       each_vector(near, [&](int y, int x) {
-        high = most(high, load<vec>(near.at(y, x)));
-        low = least(low, load<vec>(near.at(y, x)));
+        high = max(high, load<vec>(near.at(y, x)));
+        low = min(low, load<vec>(near.at(y, x)));
       });
-      if (!map_.steps && !(largest(high) - smallest(low) > 0.5f * step(0))) return;
+      if (!map_.steps && !(reduce_max(high) - reduce_min(low) > 0.5f * step(0))) return;
       const Group group{part, lamps_of(part, near)};
       if (group.edges.empty()) return;
       const Part around = bounds(group).grown(REACH), covered = around.grown(reach), whole = covered.grown(USUAL_REACH);
@@ -1172,7 +1182,7 @@ class Repair {
       max_filter<2>(bright, peak, rows, covered);
       each_vector(covered, [&](int y, int x) {
         const vec own = load<vec>(bright.at(y, x));
-        store(usual.at(y, x), own > 2.0f * load<vec>(usual.at(y, x)) ? own / most(load<vec>(peak.at(y, x)), all(1e-30f)) : vec{});
+        store(usual.at(y, x), own > 2.0f * load<vec>(usual.at(y, x)) ? own / max(load<vec>(peak.at(y, x)), broadcast(1e-30f)) : vec{});
       });
       clamp_to_frame(usual, covered);
       gaussian(usual, blurred, rows, around, sigma);
@@ -1226,9 +1236,9 @@ class Repair {
     const Grid bright(whole), usual(part), rows(whole);
     brightest(bright, usual, rows, part);
     vec any{};
-    each_vector(part, [&](int y, int x) { any = most(any, load<vec>(bright.at(y, x)) > 4.0f * load<vec>(usual.at(y, x)) ? all(1.0f) : vec{}); });
+    each_vector(part, [&](int y, int x) { any = max(any, load<vec>(bright.at(y, x)) > 4.0f * load<vec>(usual.at(y, x)) ? broadcast(1.0f) : vec{}); });
     std::vector<Edge> found;
-    if (!(largest(any) > 0)) return found;
+    if (!(reduce_max(any) > 0)) return found;
     const Part &around = up;
     const Grid down(around), high(part), low(part), peak(part);
     fetch(map_.nearness, down, [this](float v) { return -sign_ * valid(v); });

@@ -1,10 +1,27 @@
 // Prepares a scene: cleaned copies, second surfaces, highlights.
-#include "engine.h"
-
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
 #include <limits>
+#include <memory>
+#include <utility>
+#include <vector>
 
+#include "api.h"
+#include "blocks.h"
+#include "blur_axis.h"
+#include "composite.h"
 #include "constants/checksum.h"
 #include "constants/exposure.h"
+#include "constants/native.h"
+#include "disocclusion.h"
+#include "entry.h"
+#include "extremes.h"
+#include "field_mask.h"
+#include "job.h"
+#include "layers.h"
+#include "simd.h"
+#include "threads.h"
 
 namespace torchdof {
 
@@ -34,8 +51,8 @@ void ends_of(const float *values, int width, int rows, float *low, float *high) 
       float *const its_lows = &lows[i * LANES], *const its_highs = &highs[i * LANES];
       if ((i + 1) * BLOCK <= width)
         for (int x = 0; x < BLOCK; x += LANES) {
-          store(its_lows, least(load<vec>(of_block + x), load<vec>(its_lows)));
-          store(its_highs, most(load<vec>(of_block + x), load<vec>(its_highs)));
+          store(its_lows, min(load<vec>(of_block + x), load<vec>(its_lows)));
+          store(its_highs, max(load<vec>(of_block + x), load<vec>(its_highs)));
         }
       else
         for (int x = 0; x < width - i * BLOCK; x++) {
@@ -44,8 +61,8 @@ void ends_of(const float *values, int width, int rows, float *low, float *high) 
         }
     }
   for (int i = 0; i < blocks; i++) {
-    low[i] = smallest(load<vec>(&lows[i * LANES]));
-    high[i] = largest(load<vec>(&highs[i * LANES]));
+    low[i] = reduce_min(load<vec>(&lows[i * LANES]));
+    high[i] = reduce_max(load<vec>(&highs[i * LANES]));
   }
 }
 
@@ -95,7 +112,7 @@ void Job::take_scene() {
           for (int c = 0; c < channels; c++) clean_light[c * area + i] = valid ? surfaces.light[c * area + i] : 0.0f;
           validity[i] = valid;
         }
-        clean_coc[i] = valid ? clamp(surfaces.coc[i], low, high) : 0.0f;
+        clean_coc[i] = valid ? std::clamp(surfaces.coc[i], low, high) : 0.0f;
       }
     });
     surfaces.coc = clean_coc.data();
@@ -141,16 +158,16 @@ void find_ends(const float *values, int64_t count, int threads, float *low, floa
   torchdof::parallel(threads, parts, nullptr, [&](int part, int) {
     const float *const its_values = values + part * PART;
     const int its_count = (int)std::min(PART, count - part * PART), whole = its_count / LANES * LANES;
-    vec its_lows = all(INFINITY), its_highs = all(-INFINITY), any_nan = {};
+    vec its_lows = broadcast(INFINITY), its_highs = broadcast(-INFINITY), any_nan = {};
     const auto look = [&](vec v) {
-      its_lows = least(v, its_lows);
-      its_highs = most(v, its_highs);
-      any_nan = v == v ? any_nan : all(1.0f);
+      its_lows = min(v, its_lows);
+      its_highs = max(v, its_highs);
+      any_nan = v == v ? any_nan : broadcast(1.0f);
     };
     for (int i = 0; i < whole; i += LANES) look(load<vec>(its_values + i));
-    for (int i = whole; i < its_count; i++) look(all(its_values[i]));
-    lows[part] = any_positive(any_nan) ? NAN : smallest(its_lows);
-    highs[part] = any_positive(any_nan) ? NAN : largest(its_highs);
+    for (int i = whole; i < its_count; i++) look(broadcast(its_values[i]));
+    lows[part] = any_positive(any_nan) ? NAN : reduce_min(its_lows);
+    highs[part] = any_positive(any_nan) ? NAN : reduce_max(its_highs);
   });
   *low = INFINITY;
   *high = -INFINITY;

@@ -8,14 +8,26 @@
 //   light = sum n_j I_j / sum n_j,   coc = sum n_j d_j / sum n_j,   weight = sum n_j
 //
 // A coarser level has samples of the finer one as its pixels, which have one surface and a weight.
-#include "engine.h"
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+
+#include "api.h"
+#include "blocks.h"
+#include "blur_axis.h"
+#include "constants/disocclusion.h"
+#include "constants/native.h"
+#include "disocclusion.h"
+#include "entry.h"
+#include "light.h"
 #include "rules.h"
+#include "threads.h"
 
 namespace torchdof {
 namespace {
 
+constexpr int MOST_PLANES = constants::native::MOST_PLANES;
 constexpr float MIXED = constants::disocclusion::MIXED;
-constexpr float LEAST_TOTAL = constants::disocclusion::LEAST_TOTAL;
 constexpr int BAND = 32;                // rows of pixels whose gradients one thread adds up
 
 // The pixels of an axis around each sample: `taps` of them from 2 sample - before on, which the frame's ends repeat.

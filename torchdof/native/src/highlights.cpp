@@ -1,9 +1,26 @@
 // Highlights: light far brighter than its surroundings is removed from the layers and rendered ray by ray, as described
 // in render/highlights.py.
-#include "engine.h"
-#include "rules.h"
+#include "highlights.h"
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstdlib>
+#include <cstring>
+#include <vector>
+
+#include "blocks.h"
+#include "blur_axis.h"
 #include "constants/highlights.h"
 #include "constants/plan.h"
+#include "extremes.h"
+#include "field_mask.h"
+#include "job.h"
+#include "light.h"
+#include "memory.h"
+#include "rules.h"
+#include "simd.h"
+#include "surfaces.h"
 
 namespace torchdof {
 namespace {
@@ -67,8 +84,8 @@ float ranked(int rank, const float *values, int vectors) {
 
 float threshold_at(const Job &job, int y, int x) {
   const int rows = job.threshold_rows, columns = job.threshold_columns;
-  const float at_y = clamp((y + job.threshold_top + 0.5f) / THRESHOLD_CELL - 0.5f, 0.0f, rows - 1.0f);
-  const float at_x = clamp((x + job.threshold_left + 0.5f) / THRESHOLD_CELL - 0.5f, 0.0f, columns - 1.0f);
+  const float at_y = std::clamp((y + job.threshold_top + 0.5f) / THRESHOLD_CELL - 0.5f, 0.0f, rows - 1.0f);
+  const float at_x = std::clamp((x + job.threshold_left + 0.5f) / THRESHOLD_CELL - 0.5f, 0.0f, columns - 1.0f);
   const int top = std::min((int)at_y, rows - 2), left = std::min((int)at_x, columns - 2);
   const float down = at_y - top, across = at_x - left;
   const float *upper = &job.threshold[(size_t)top * columns + left], *lower = upper + columns;
@@ -156,10 +173,10 @@ void Job::extract_highlights() {
       const int x0 = bx * BLOCK, n = std::min(BLOCK, width - x0), block = by * surfaces.block_columns + bx;
       const float least_limit = least_threshold(*this, by * BLOCK, x0);
       if (!surfaces.full_planes()) {
-        vec peak = all(block_peak[block]);
+        vec peak = broadcast(block_peak[block]);
         const float *of_block = surfaces.blocks[block];  // light of both surfaces comes first
-        for (int i = 0; of_block && i < 2 * channels * BLOCK_PIXELS; i += LANES) peak = most(peak, load<vec>(of_block + i));
-        if (!any_of(peak > all(least_limit))) continue;
+        for (int i = 0; of_block && i < 2 * channels * BLOCK_PIXELS; i += LANES) peak = max(peak, load<vec>(of_block + i));
+        if (!any_of(peak > least_limit)) continue;
       }
       for (int y = by * BLOCK; y < std::min(height, (by + 1) * BLOCK); y++) {
         for (int i = 0; i < count; i++) {
@@ -298,11 +315,11 @@ Visibility find_visibility(const Job &job, const RayKernels &kernels) {
     wide classes = {}, remainders = {};
   };
   auto add_bits = [&](Bits &bits, vec coc, ivec shown) {
-    const vec place = least(most(coc - low, vec{}), all(high - low));
+    const vec place = min(max(coc - low, vec{}), broadcast(high - low));
     auto bit = [&](ivec which) { return __builtin_convertvector(shown, wide) & ((wide{} + 1) << __builtin_convertvector(which, wide)); };
-    bits.classes |= bit(least(convert(place * (1.0f / v.class_width)), ivec{} + (v.CLASSES - 1)));
+    bits.classes |= bit(min(convert(place * (1.0f / v.class_width)), ivec{} + (v.CLASSES - 1)));
     // at a bin's border both bins, because rays compute the distance from it with another rounding error
-    for (const float border : {-1 / 16.0f, 1 / 16.0f}) bits.remainders |= bit(convert(most(place + border, vec{})) & 63);
+    for (const float border : {-1 / 16.0f, 1 / 16.0f}) bits.remainders |= bit(convert(max(place + border, vec{})) & 63);
   };
   job.parallel(v.cell_rows, [&](int row, int) {
     Visibility::Cell *cells = &v.cells[(size_t)row * v.cell_columns];
@@ -317,12 +334,12 @@ Visibility find_visibility(const Job &job, const RayKernels &kernels) {
       const bool flat = !surfaces.full_planes() && ends[1] - ends[0] < 1;
       Bits bits[BLOCK / CELL];
       for (Bits &of_cell : bits)
-        for (float coc : ends) add_bits(of_cell, all(coc), ivec{} - flat);
+        for (float coc : ends) add_bits(of_cell, broadcast(coc), ivec{} - flat);
       for (int y = row * CELL; y < std::min(H, (row + 1) * CELL) && !(flat && !surfaces.has_block(block)); y++)
         each_shown(surfaces, y, x, light.data(), [&](bool own, const float *coc, const float *weight, float least_weight) {
           if (own && flat) return;
           for (int j = 0; j < BLOCK; j += LANES)
-            add_bits(bits[j / CELL], load<vec>(coc + j), weight ? load<vec>(weight + j) > all(least_weight) : ivec{} == 0);
+            add_bits(bits[j / CELL], load<vec>(coc + j), weight ? load<vec>(weight + j) > least_weight : ivec{} == 0);
         });
       for (int j = 0; j < n; j += CELL)
         for (int i = 0; i < LANES; i++) {
@@ -349,11 +366,11 @@ bool cover_row(const Job &job, int y, int block_column, int block_columns, float
     for (int j = 0; j < BLOCK; j += LANES) store(covered + j, vec{});
     each_shown(job.surfaces, y, x, light, [&](bool, const float *coc, const float *weight, float least_weight) {
       for (int j = 0; j < BLOCK; j += LANES) {
-        const vec apart = load<vec>(coc + j) - all(place);
-        vec cover = most(all(1.0f) - most(apart, -apart), vec{});
-        if (weight) cover *= most(load<vec>(weight + j) - all(least_weight), vec{});
+        const vec apart = load<vec>(coc + j) - place;
+        vec cover = max(1.0f - max(apart, -apart), vec{});
+        if (weight) cover *= max(load<vec>(weight + j) - least_weight, vec{});
         store(covered + j, load<vec>(covered + j) + cover);
-        most_cover = most(most_cover, cover);
+        most_cover = max(most_cover, cover);
       }
     });
   }
@@ -370,7 +387,7 @@ void add_blocked(const Job &job, const Visibility &v, const Ray &ray, int k, int
   int column[PATCH];
   float across[PATCH];
   for (int i = 0; i < columns; i++) {
-    const float at_x = clamp(ray.column + (x + i - ray.column) * along, 0.0f, W - 1.0f);
+    const float at_x = std::clamp(ray.column + (x + i - ray.column) * along, 0.0f, W - 1.0f);
     column[i] = (int)at_x;
     across[i] = at_x - column[i];
   }
@@ -415,7 +432,7 @@ void add_blocked(const Job &job, const Visibility &v, const Ray &ray, int k, int
     return meets[row % 2];
   };
   for (int i = 0; i < rows; i++) {
-    const float at_y = clamp(ray.row + (y + i - ray.row) * along, 0.0f, H - 1.0f);
+    const float at_y = std::clamp(ray.row + (y + i - ray.row) * along, 0.0f, H - 1.0f);
     const int row = std::min((int)at_y, std::max(0, H - 2)), below = H > 1 ? row + 1 : row;
     const bool upper = take_row(row), lower = take_row(below);
     if (!upper && !lower) continue;
@@ -466,7 +483,7 @@ std::vector<float> gains_of(const Job &job, const RayKernels &kernels) {
       for (int x = 0; x < side; x += LANES) {
         const vec light = load<vec>(row.data() + x);
         if (!any_positive(light)) continue;
-        const vec passed = light * mask.transmittance(all((float)y), (float)(x - half) + counting());
+        const vec passed = light * mask.transmittance(broadcast((float)y), (float)(x - half) + iota());
         for (int lane = 0; lane < LANES; lane++) all_light += light[lane], left += passed[lane];
       }
     }
@@ -502,7 +519,7 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
       const float along = 1.0f - (v.low + k) / ray.coc;
       const float ya = ray.row + (y - ray.row) * along, yb = ray.row + (y + rows - 1 - ray.row) * along;
       const float xa = ray.column + (x - ray.column) * along, xb = ray.column + (x + columns - 1 - ray.column) * along;
-      auto cell = [](float at, int size) { return (int)clamp(at, 0.0f, size - 1.0f) / CELL; };
+      auto cell = [](float at, int size) { return (int)std::clamp(at, 0.0f, size - 1.0f) / CELL; };
       const int r0 = cell(std::floor(std::min(ya, yb)), H), r1 = cell(std::max(ya, yb) + 1, H);
       const int c0 = cell(std::floor(std::min(xa, xb)), W), c1 = cell(std::max(xa, xb) + 1, W);
       const uint64_t classes = v.classes_of(k), remainders = v.remainders_of(k);
@@ -522,10 +539,10 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
       for (int k : nearer) {
         if (!may_meet(k, y, x, rows, columns)) continue;
         add_blocked(job, v, ray, k, y, x, rows, columns, surface_light.data(), blocked);
-        vec least_blocked = all(1.0f);
+        vec least_blocked = broadcast(1.0f);
         for (int i = 0; i < rows; i++)
-          for (int j = 0; j < PATCH; j += LANES) least_blocked = least(least_blocked, load<vec>(blocked[i] + j));
-        if (!any_of(least_blocked < all(1.0f))) return true;
+          for (int j = 0; j < PATCH; j += LANES) least_blocked = min(least_blocked, load<vec>(blocked[i] + j));
+        if (!any_of(least_blocked < 1.0f)) return true;
       }
       return false;
     };
@@ -541,7 +558,7 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
             add_taps(ray_kernels, ray, e, py + i - ray.row, px - ray.column, nx, row);
             for (int x = 0; x < nx && gain > 0; x += LANES)
               if (any_positive(load<vec>(row + x)))
-                store(row + x, load<vec>(row + x) * gain * masks[e].transmittance(all((float)(py + i - ray.row)), (float)(px + x - ray.column) + counting()));
+                store(row + x, load<vec>(row + x) * gain * masks[e].transmittance(broadcast((float)(py + i - ray.row)), (float)(px + x - ray.column) + iota()));
             for (int x = 0; x < PATCH; x += LANES) any |= any_positive(load<vec>(row + x));
           }
         }

@@ -1,6 +1,15 @@
 // Makes kernels of any radius from a lens's templates; formulas in optics/kernel_bank.py and optics/psf.py.
-#include "engine.h"
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstdlib>
+#include <memory>
+#include <vector>
+
+#include "api.h"
 #include "constants/psf.h"
+#include "entry.h"
+#include "threads.h"
 
 namespace torchdof {
 namespace {

@@ -13,13 +13,23 @@
 // A cell of BEHIND_STEP x BEHIND_STEP pixels has the smallest coc of its pixels. Its first result is the farthest surface of
 // all levels: of two levels with different surfaces, only the farther one counts. Its second result is the one above, of
 // the coarse levels alone.
-#include "engine.h"
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <vector>
+
+#include "api.h"
+#include "blocks.h"
+#include "constants/native.h"
+#include "disocclusion.h"
+#include "entry.h"
 #include "rules.h"
+#include "threads.h"
 
 namespace torchdof {
 namespace {
 
-constexpr float LEAST_TOTAL = constants::disocclusion::LEAST_TOTAL;
+constexpr int MOST_PLANES = constants::native::MOST_PLANES;
 constexpr int BAND = 32;  // least rows of places whose gradients one thread adds up
 
 // Places of an axis, pixels or cells, `step` pixels apart and centred on an image; and the pixels of each place, as _window

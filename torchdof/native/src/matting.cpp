@@ -1,9 +1,30 @@
 // Matting: a pixel at a depth edge mixes the light of two surfaces but has the depth of one. Splits it into both, as
 // described in render/surfaces/matting.py and render/surfaces/emitters.py.
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstdlib>
+#include <cstring>
+#include <memory>
+#include <mutex>
+#include <vector>
+
+#include "api.h"
+#include "blocks.h"
+#include "blur_axis.h"
 #include "constants/emitters.h"
 #include "constants/matting.h"
 #include "constants/pipeline.h"
-#include "engine.h"
+#include "entry.h"
+#include "extremes.h"
+#include "highlights.h"
+#include "job.h"
+#include "light.h"
+#include "memory.h"
+#include "rules.h"
+#include "simd.h"
+#include "surfaces.h"
+#include "threads.h"
 
 namespace torchdof {
 namespace {
@@ -107,40 +128,40 @@ bool find_edges(const Frame &frame, int y0, int x0, Window &w) {
     float least_of[PITCH + LANES], most_of[PITCH + LANES];
     for (int j = 0; j < PITCH; j += LANES) {
       auto row = [&](const float *values, int k) { return load<vec>(values + (i + k) * PITCH + j); };
-      store(least_of + j, least(least(row(low, 0), row(low, 1)), row(low, 2)));
-      store(most_of + j, most(most(row(high, 0), row(high, 1)), row(high, 2)));
+      store(least_of + j, min(min(row(low, 0), row(low, 1)), row(low, 2)));
+      store(most_of + j, max(max(row(high, 0), row(high, 1)), row(high, 2)));
     }
     for (int j = 0; j < PITCH; j += LANES) {
       auto high_of = [&](int k) { return load<vec>(most_of + j + k); };
       auto low_of = [&](int k) { return load<vec>(least_of + j + k); };
-      const vec gap = most(most(high_of(0), high_of(1)), high_of(2)) - least(least(low_of(0), low_of(1)), low_of(2));
-      const vec edge = clamp01(gap * (1.0f / EDGE_PX) - all(1.0f));
+      const vec gap = max(max(high_of(0), high_of(1)), high_of(2)) - min(min(low_of(0), low_of(1)), low_of(2));
+      const vec edge = clamp01(gap * (1.0f / EDGE_PX) - 1.0f);
       store(w.edge + i * PITCH + j, valid ? edge * load<vec>(w.valid + (i + 1) * PITCH + j + 1) : edge);
     }
   }
   each_outside(frame, y0, x0, [&](int from, int to) { w.edge[from] = w.edge[to]; });
   vec most_edge = {};
   for (int i = RIM; i < RIM + BLOCK; i++)
-    for (int j = RIM; j < RIM + BLOCK; j += LANES) most_edge = most(most_edge, load<vec>(w.edge + i * PITCH + j));
+    for (int j = RIM; j < RIM + BLOCK; j += LANES) most_edge = max(most_edge, load<vec>(w.edge + i * PITCH + j));
   return any_positive(most_edge);
 }
 
 inline int tap(int i) { return i / AROUND * PITCH + i % AROUND; }
-inline vec only(ivec where, vec value) { return where ? value : vec{}; }
+inline vec select(ivec where, vec value) { return where ? value : vec{}; }
 inline void add(float *to, vec value) { store(to, load<vec>(to) + value); }
 // Where a value is not limited by clamp01, so that it has a gradient.
-inline ivec is_within(vec value) { return (value >= vec{}) & (value <= all(1.0f)); }
+inline ivec is_within(vec value) { return (value >= vec{}) & (value <= 1.0f); }
 
 // The nearest and farthest coc of the 3 x 3 pixels from a place of a window on.
 struct Ends {
-  vec near = all(NEVER), far = all(-NEVER);
+  vec near = broadcast(NEVER), far = broadcast(-NEVER);
 
   Ends(const Window &w, int at, bool masked) {
     for (int i = 0; i < TAPS; i++) {
       const vec coc = load<vec>(w.coc + at + tap(i));
       const ivec valid = masked ? load<vec>(w.valid + at + tap(i)) > vec{} : vec{} == vec{};
-      near = least(near, valid ? coc : all(NEVER));
-      far = most(far, valid ? coc : all(-NEVER));
+      near = min(near, valid ? coc : broadcast(NEVER));
+      far = max(far, valid ? coc : broadcast(-NEVER));
     }
   }
 
@@ -150,10 +171,10 @@ struct Ends {
     for (int pass = 0; pass < 2; pass++)
       for (int i = 0; i < TAPS; i++) {
         const vec coc = load<vec>(w.coc + at + tap(i));
-        const vec counts = masked ? only(load<vec>(w.valid + at + tap(i)) > vec{}, all(1.0f)) : all(1.0f);
-        const vec is_near = only(coc == near, counts), is_far = only(coc == far, counts);
+        const vec counts = masked ? select(load<vec>(w.valid + at + tap(i)) > vec{}, broadcast(1.0f)) : broadcast(1.0f);
+        const vec is_near = select(coc == near, counts), is_far = select(coc == far, counts);
         if (pass)
-          add(of_coc + at + tap(i), of_near * is_near / most(nearest, all(1.0f)) + of_far * is_far / most(farthest, all(1.0f)));
+          add(of_coc + at + tap(i), of_near * is_near / max(nearest, broadcast(1.0f)) + of_far * is_far / max(farthest, broadcast(1.0f)));
         else
           nearest += is_near, farthest += is_far;
       }
@@ -183,13 +204,13 @@ void clean_light(const Frame &frame, int y0, int x0, Window &w, const float *fal
       vec near_by[TAPS], unmixed[TAPS], alike[TAPS], apart[TAPS], weight[TAPS], total = {};
       for (int k = 0; k < TAPS; k++) {
         apart[k] = (load<vec>(w.coc + at + tap(k)) - coc) * (1.0f / EDGE_PX);
-        near_by[k] = frame.valid ? falloff[k] * load<vec>(w.valid + at + tap(k)) : all(falloff[k]);
-        unmixed[k] = (all(1.0f + UNCLEAN) - load<vec>(w.edge + first + tap(k))) * near_by[k];
-        alike[k] = 2.0f - 2.0f * size_of(apart[k]);
+        near_by[k] = frame.valid ? falloff[k] * load<vec>(w.valid + at + tap(k)) : broadcast(falloff[k]);
+        unmixed[k] = (broadcast(1.0f + UNCLEAN) - load<vec>(w.edge + first + tap(k))) * near_by[k];
+        alike[k] = 2.0f - 2.0f * abs(apart[k]);
         weight[k] = unmixed[k] * clamp01(alike[k]);
         total += weight[k];
       }
-      const vec enough = total - 10.0f * UNCLEAN, is_clean = edge * clamp01(enough), per_total = 1.0f / most(total, all(1e-12f));
+      const vec enough = total - 10.0f * UNCLEAN, is_clean = edge * clamp01(enough), per_total = 1.0f / max(total, broadcast(1e-12f));
       vec of_is_clean = {}, of_weight[TAPS] = {}, of_middle = {};
       for (int c = 0; c < frame.channels; c++) {
         const float *const light = &w.light[c * plane];
@@ -211,9 +232,9 @@ void clean_light(const Frame &frame, int y0, int x0, Window &w, const float *fal
       if (!slopes) continue;
       add(slopes->edge + at, of_is_clean * clamp01(enough));
       for (int k = 0; k < TAPS; k++) {
-        const vec slope = of_weight[k] + only(is_within(enough), of_is_clean * edge);
+        const vec slope = of_weight[k] + select(is_within(enough), of_is_clean * edge);
         add(slopes->edge + first + tap(k), -slope * clamp01(alike[k]) * near_by[k]);
-        const vec of_apart = only(is_within(alike[k]), slope * unmixed[k] * (-2.0f / EDGE_PX)) * (only(apart[k] > vec{}, all(1.0f)) - only(apart[k] < vec{}, all(1.0f)));
+        const vec of_apart = select(is_within(alike[k]), slope * unmixed[k] * (-2.0f / EDGE_PX)) * (select(apart[k] > vec{}, broadcast(1.0f)) - select(apart[k] < vec{}, broadcast(1.0f)));
         add(slopes->coc + at + tap(k), of_apart);
         of_middle -= of_apart;
       }
@@ -251,11 +272,11 @@ class Split {
       float *const to = plane + y_ * BLOCK + x_;
       store(to, beside ? value : load<vec>(to));
     };
-    const vec own = 1.0f - weight_, per_own = 1.0f / own, per_other = 1.0f / most(weight_, all(1e-12f));
+    const vec own = 1.0f - weight_, per_own = 1.0f / own, per_other = 1.0f / max(weight_, broadcast(1e-12f));
     for (int c = 0; c < C(); c++) {
       const vec others = Other(*this, c).light;
       put(block.own + c * BLOCK_PIXELS, (colour_[c] - others) * per_own * scale_);
-      put(block.other + c * BLOCK_PIXELS, only(weight_ > vec{}, others * per_other) * scale_);
+      put(block.other + c * BLOCK_PIXELS, select(weight_ > vec{}, others * per_other) * scale_);
     }
     const vec valid = valid_[TAPS / 2];
     put(block.coc, is_near_ ? ends_.far : ends_.near);
@@ -283,14 +304,14 @@ class Split {
       own_mean = s.is_near_ ? s.front_[c] : s.behind_[c], mean = s.is_near_ ? s.behind_[c] : s.front_[c];
       unexplained = s.colour_[c] - own * own_mean - weight * mean;
       of_each = s.lent_ * weight / (weight * weight + own * own);
-      darkest = most(s.frame_.darkest[c] / s.scale_, all(-UNBOUNDED)), brightest = least(s.frame_.brightest[c] / s.scale_, all(UNBOUNDED));
+      darkest = max(s.frame_.darkest[c] / s.scale_, broadcast(-UNBOUNDED)), brightest = min(s.frame_.brightest[c] / s.scale_, broadcast(UNBOUNDED));
       own_darkest = s.colour_[c] - own * darkest, own_brightest = s.colour_[c] - own * brightest;
       // the two parts still sum to the pixel, and neither is brighter or darker than the image
       steps[0] = weight * (mean + unexplained * of_each);
-      steps[1] = most(steps[0], own_brightest);
-      steps[2] = least(steps[1], own_darkest);
-      steps[3] = most(steps[2], weight * darkest);
-      light = least(steps[3], weight * brightest);
+      steps[1] = max(steps[0], own_brightest);
+      steps[2] = min(steps[1], own_darkest);
+      steps[3] = max(steps[2], weight * darkest);
+      light = min(steps[3], weight * brightest);
     }
   };
 
@@ -298,7 +319,7 @@ class Split {
   vec mean(const vec *light, const vec *weight, vec *mean) const {
     vec total = {}, variance = {};
     for (int i = 0; i < TAPS; i++) total += weight[i];
-    total = most(total, all(1e-12f));  // divided by, not multiplied with its inverse: equal values are exactly their mean
+    total = max(total, broadcast(1e-12f));  // divided by, not multiplied with its inverse: equal values are exactly their mean
     for (int c = 0; c < C(); c++, light += TAPS) {
       vec one = {}, two = {};
       for (int i = 0; i < TAPS; i++) one += light[i] * weight[i];
@@ -313,7 +334,7 @@ class Split {
   void back_of_mean(const vec *light, const vec *weight, const vec *mean, vec variance, const vec *of_mean, vec of_variance, vec *of_light, vec *of_weight) const {
     vec total = {};
     for (int i = 0; i < TAPS; i++) total += weight[i];
-    const vec each = 1.0f / most(total, all(1e-12f));
+    const vec each = 1.0f / max(total, broadcast(1e-12f));
     for (int i = 0; i < TAPS; i++) {
       vec sum = -of_variance * variance;
       for (int c = 0; c < C(); c++) {
@@ -327,36 +348,36 @@ class Split {
 
   void find_colours() {
     const int plane = EDGES * PITCH;
-    for (int i = 0; i < TAPS; i++) valid_[i] = masked_ ? load<vec>(w_.valid + in_coc_ + tap(i)) : all(1.0f);
-    scale_ = all(TINY);  // brightest light around; all light is relative to it
+    for (int i = 0; i < TAPS; i++) valid_[i] = masked_ ? load<vec>(w_.valid + in_coc_ + tap(i)) : broadcast(1.0f);
+    scale_ = broadcast(TINY);  // brightest light around; all light is relative to it
     for (int c = 0; c < C(); c++)
       for (int i = 0; i < TAPS; i++) {
         light_[c * TAPS + i] = load<vec>(&w_.light[c * plane + first_ + tap(i)]);
-        scale_ = most(scale_, size_of(light_[c * TAPS + i]));
+        scale_ = max(scale_, abs(light_[c * TAPS + i]));
       }
     for (int i = 0; i < C() * TAPS; i++) light_[i] /= scale_;
     for (int c = 0; c < C(); c++) colour_[c] = light_[c * TAPS + TAPS / 2];
 
     here_ = load<vec>(w_.coc + in_coc_ + tap(TAPS / 2));
-    gap_ = most(ends_.far - ends_.near, all(1e-6f));
+    gap_ = max(ends_.far - ends_.near, broadcast(1e-6f));
     vec counted = {};  // sum of the weights of the small Gaussian
     covered_ = vec{};
     for (int i = 0; i < TAPS; i++) {
-      const vec weight = (all(1.0f + UNCLEAN) - load<vec>(w_.edge + first_ + tap(i))) * falloff_[i] * valid_[i];
+      const vec weight = (broadcast(1.0f + UNCLEAN) - load<vec>(w_.edge + first_ + tap(i))) * falloff_[i] * valid_[i];
       const vec nearness = (ends_.far - load<vec>(w_.coc + in_coc_ + tap(i))) / gap_;  // not times 1 / gap, whose rounding the clamps below enlarge
       nearer_[i] = weight * clamp01(4.0f * nearness - 2.8f);
       farther_[i] = weight * clamp01(1.2f - 4.0f * nearness);
       small_[i] = (i == TAPS / 2 ? 1.0f : i % 2 ? SMALL_BESIDE : SMALL_DIAGONAL) * valid_[i];
       covered_ += small_[i] * nearness, counted += small_[i];
     }
-    per_counted_ = 1.0f / most(counted, all(1e-12f));
+    per_counted_ = 1.0f / max(counted, broadcast(1e-12f));
     covered_ *= per_counted_;
 
     const vec per_scale = 1.0f / scale_;
     for (int c = 0; c < C(); c++)
       for (int i = 0; i < TAPS; i++) {
         const vec relative = load<vec>(&w_.clean[c * plane + first_ + tap(i)]) * per_scale;
-        clean_[c * TAPS + i] = most(least(relative, all(MOST_CLEAN)), all(-MOST_CLEAN));
+        clean_[c * TAPS + i] = max(min(relative, broadcast(MOST_CLEAN)), broadcast(-MOST_CLEAN));
       }
     clean_far_variance_ = mean(clean_, farther_, clean_behind_), clean_near_variance_ = mean(clean_, nearer_, clean_front_);
     vec strength = {};
@@ -388,36 +409,36 @@ class Split {
       along += (colour_[c] - behind_[c]) * contrast;
     }
     is_near_ = here_ - ends_.near < ends_.far - here_;
-    along_ = along / most(strength_, all(1e-12f)), fitted_ = clamp01(along_);
+    along_ = along / max(strength_, broadcast(1e-12f)), fitted_ = clamp01(along_);
     for (int c = 0; c < C(); c++) {
       const vec left = colour_[c] - behind_[c] - fitted_ * (front_[c] - behind_[c]);
       misfit_ += left * left;
     }
-    sharper_ = size_of(here_) - size_of(is_near_ ? ends_.far : ends_.near), lent_ = 1.0f - clamp01(sharper_);
+    sharper_ = abs(here_) - abs(is_near_ ? ends_.far : ends_.near), lent_ = 1.0f - clamp01(sharper_);
     noise_ = far_variance_ + near_variance_ + ALIKE * ALIKE;
     total_ = strength_ + TRUST * (far_variance_ + near_variance_ + misfit_) + ALIKE * ALIKE;
     trust_ = strength_ / total_;
     edge_ = load<vec>(w_.edge + first_ + tap(TAPS / 2));
-    sided_ = size_of((here_ - ends_.near) - (ends_.far - here_)) * (all(1.0f) / gap_);
+    sided_ = abs((here_ - ends_.near) - (ends_.far - here_)) * (1.0f / gap_);
     clear_ = edge_ * clamp01(4.0f * sided_ - 2.0f), contradiction_ = misfit_ + (covered_ - fitted_) * (covered_ - fitted_) * strength_;
     by_fit_ = is_near_ ? 1.0f - fitted_ : fitted_, by_cover_ = is_near_ ? 1.0f - covered_ : covered_;
     wide_ = gap_ * (1.0f / EDGE_PX) - 2.0f;
-    geometric_ = least(by_cover_, all(0.5f)) * clear_ * (1.0f - trust_) * clamp01(wide_);
-    weight_ = least(by_fit_, all(0.5f)) * (clear_ * trust_) + geometric_ * noise_ / (noise_ + contradiction_);
+    geometric_ = min(by_cover_, broadcast(0.5f)) * clear_ * (1.0f - trust_) * clamp01(wide_);
+    weight_ = min(by_fit_, broadcast(0.5f)) * (clear_ * trust_) + geometric_ * noise_ / (noise_ + contradiction_);
   }
 
   // The gradients by the weight and the colours, from those by the surfaces.
   void back_of_parts(Slopes &slopes, ivec beside) {
-    const auto slope = [&](int plane) { return only(beside, load<vec>(&slopes.surfaces[plane * BLOCK * PITCH + y_ * PITCH + x_])); };
-    const vec own = 1.0f - weight_, known = most(weight_, all(1e-12f)), squares = weight_ * weight_ + own * own;
+    const auto slope = [&](int plane) { return select(beside, load<vec>(&slopes.surfaces[plane * BLOCK * PITCH + y_ * PITCH + x_])); };
+    const vec own = 1.0f - weight_, known = max(weight_, broadcast(1e-12f)), squares = weight_ * weight_ + own * own;
     vec of_own = {}, of_lent = {};
     of_weight_ = slope(2 * C() + 1);
     const vec of_coc = slope(2 * C());
-    of_near_ = only(~is_near_, of_coc), of_far_ = only(is_near_, of_coc);
+    of_near_ = select(~is_near_, of_coc), of_far_ = select(is_near_, of_coc);
     for (int c = 0; c < C(); c++) {
       const Other other(*this, c);
       const vec own_light = (colour_[c] - other.light) / own, other_light = other.light / known;
-      const vec of_own_light = slope(c) * scale_, of_other_light = only(weight_ > vec{}, slope(C() + c) * scale_);
+      const vec of_own_light = slope(c) * scale_, of_other_light = select(weight_ > vec{}, slope(C() + c) * scale_);
       const vec of_part = of_own_light / own;
       vec of_colour = of_part, of_mean = {};
       of_own -= of_part * own_light;
@@ -426,7 +447,7 @@ class Split {
       of_weight_ -= of_part * other_light;
       // the gradient goes to the limit in force, or by halves to two equal ones
       const auto limited = [&](vec light, vec limit, bool upper) {
-        const vec by_limit = only(upper ? limit < light : limit > light, all(1.0f)) + only(limit == light, all(0.5f)), taken = of_light * by_limit;
+        const vec by_limit = select(upper ? limit < light : limit > light, broadcast(1.0f)) + select(limit == light, broadcast(0.5f)), taken = of_light * by_limit;
         of_light -= taken;
         return taken;
       };
@@ -436,8 +457,8 @@ class Split {
       of_own -= by_darkest * other.darkest + by_brightest * other.brightest;
       of_weight_ -= (by_darkest + by_brightest) * other_light;
       of_darkest -= by_darkest * own, of_brightest -= by_brightest * own;
-      slopes.darkest[c] += sum(only(beside & (other.darkest > all(-UNBOUNDED)), of_darkest / scale_));
-      slopes.brightest[c] += sum(only(beside & (other.brightest < all(UNBOUNDED)), of_brightest / scale_));
+      slopes.darkest[c] += reduce_add(select(beside & (other.darkest > -UNBOUNDED), of_darkest / scale_));
+      slopes.brightest[c] += reduce_add(select(beside & (other.brightest < UNBOUNDED), of_brightest / scale_));
       // light = mean + unexplained of_each, of_each = lent weight / (weight^2 + own^2)
       const vec of_each = of_light * other.unexplained * lent_, of_unexplained = of_light * other.of_each;
       of_lent += of_light * other.unexplained * weight_ / squares;
@@ -451,10 +472,10 @@ class Split {
       of_colour_[c] += of_colour;
     }
     // lent = 1 - sharper, sharper = |here| - |other coc|
-    const auto sign = [](vec value) { return only(value > vec{}, all(1.0f)) - only(value < vec{}, all(1.0f)); };
-    const vec of_sharper = only(is_within(sharper_), -of_lent), of_other = -of_sharper * sign(is_near_ ? ends_.far : ends_.near);
+    const auto sign = [](vec value) { return select(value > vec{}, broadcast(1.0f)) - select(value < vec{}, broadcast(1.0f)); };
+    const vec of_sharper = select(is_within(sharper_), -of_lent), of_other = -of_sharper * sign(is_near_ ? ends_.far : ends_.near);
     of_here_ = of_sharper * sign(here_);
-    of_near_ += only(~is_near_, of_other), of_far_ += only(is_near_, of_other);
+    of_near_ += select(~is_near_, of_other), of_far_ += select(is_near_, of_other);
     of_weight_ -= of_own;
   }
 
@@ -462,19 +483,19 @@ class Split {
   void back_of_weight() {
     const vec sum = noise_ + contradiction_, agreeing = noise_ / sum, of_geometric = of_weight_ * agreeing;
     const vec of_agreeing = of_weight_ * geometric_ / sum, of_contradiction = -of_agreeing * agreeing;
-    const vec by_cover = least(by_cover_, all(0.5f)), by_fit = least(by_fit_, all(0.5f)), wide = clamp01(wide_), doubt = 1.0f - trust_;
+    const vec by_cover = min(by_cover_, broadcast(0.5f)), by_fit = min(by_fit_, broadcast(0.5f)), wide = clamp01(wide_), doubt = 1.0f - trust_;
     const vec of_clear = of_geometric * by_cover * doubt * wide + of_weight_ * by_fit * trust_;
     const vec of_trust = (of_weight_ * by_fit - of_geometric * by_cover * wide) * clear_;
-    const vec of_by_cover = only(by_cover_ <= all(0.5f), of_geometric * clear_ * doubt * wide), of_by_fit = only(by_fit_ <= all(0.5f), of_weight_ * clear_ * trust_);
+    const vec of_by_cover = select(by_cover_ <= 0.5f, of_geometric * clear_ * doubt * wide), of_by_fit = select(by_fit_ <= 0.5f, of_weight_ * clear_ * trust_);
     const vec off = covered_ - fitted_, of_off = of_contradiction * 2.0f * off * strength_;
     of_covered_ = of_off + (is_near_ ? -of_by_cover : of_by_cover);
     vec of_fitted = (is_near_ ? -of_by_fit : of_by_fit) - of_off;
     of_edge_ = of_clear * clamp01(4.0f * sided_ - 2.0f);
-    const vec signed_side = (here_ - ends_.near) - (ends_.far - here_), side = only(signed_side > vec{}, all(1.0f)) - only(signed_side < vec{}, all(1.0f));
-    const vec of_sided = only(is_within(4.0f * sided_ - 2.0f), of_clear * edge_ * 4.0f) / gap_;
+    const vec signed_side = (here_ - ends_.near) - (ends_.far - here_), side = select(signed_side > vec{}, broadcast(1.0f)) - select(signed_side < vec{}, broadcast(1.0f));
+    const vec of_sided = select(is_within(4.0f * sided_ - 2.0f), of_clear * edge_ * 4.0f) / gap_;
     of_here_ += 2.0f * side * of_sided;
     of_near_ -= side * of_sided, of_far_ -= side * of_sided;
-    of_gap_ = only(is_within(wide_), of_geometric * by_cover * clear_ * doubt * (1.0f / EDGE_PX)) - of_sided * sided_;
+    of_gap_ = select(is_within(wide_), of_geometric * by_cover * clear_ * doubt * (1.0f / EDGE_PX)) - of_sided * sided_;
     const vec of_total = -of_trust * trust_ / total_, of_noisy = of_total * TRUST;
     vec of_strength = of_trust / total_ + of_total + of_contradiction * off * off;
     const vec of_misfit = of_contradiction + of_noisy;
@@ -485,8 +506,8 @@ class Split {
       of_behind_[c] -= of_left;
       of_fitted -= of_left * contrast;
     }
-    const vec of_along = only(is_within(along_), of_fitted) / most(strength_, all(1e-12f));
-    of_strength -= only(strength_ >= all(1e-12f), of_along * along_);
+    const vec of_along = select(is_within(along_), of_fitted) / max(strength_, broadcast(1e-12f));
+    of_strength -= select(strength_ >= broadcast(1e-12f), of_along * along_);
     const vec of_misfit_contrast = 2.0f * of_misfit * fitted_;
     for (int c = 0; c < C(); c++) {
       const vec contrast = front_[c] - behind_[c], left = colour_[c] - behind_[c];
@@ -515,7 +536,7 @@ class Split {
         of_contrast_[c] -= of_light_[c * TAPS + i] * shift;
         along += off * contrast;
       }
-      of_shift = only(is_within(nearer_[i] > farther_[i] ? -shift_[i] : shift_[i]), of_shift);
+      of_shift = select(is_within(nearer_[i] > farther_[i] ? -shift_[i] : shift_[i]), of_shift);
       of_per_strength += of_shift * along;
       of_shift *= per_strength_;
       for (int c = 0; c < C(); c++) {
@@ -539,16 +560,16 @@ class Split {
       for (int i = 0; i < TAPS; i++) {
         const int at = c * EDGES * PITCH + first_ + tap(i);
         add(&slopes.light[at], of_light_[c * TAPS + i] * per_scale);
-        add(&slopes.clean[at], only(size_of(load<vec>(&w_.clean[at]) * per_scale) <= all(MOST_CLEAN), of_clean_[c * TAPS + i] * per_scale));
+        add(&slopes.clean[at], select(abs(load<vec>(&w_.clean[at]) * per_scale) <= MOST_CLEAN, of_clean_[c * TAPS + i] * per_scale));
       }
     }
     add(slopes.edge + first_ + tap(TAPS / 2), of_edge_);
     for (int i = 0; i < TAPS; i++) {
       const int in_coc = in_coc_ + tap(i);
-      const vec near_by = falloff_[i] * valid_[i], weight = (all(1.0f + UNCLEAN) - load<vec>(w_.edge + first_ + tap(i))) * near_by;
+      const vec near_by = falloff_[i] * valid_[i], weight = (broadcast(1.0f + UNCLEAN) - load<vec>(w_.edge + first_ + tap(i))) * near_by;
       const vec nearness = (ends_.far - load<vec>(w_.coc + in_coc)) / gap_, to_near = 4.0f * nearness - 2.8f, to_far = 1.2f - 4.0f * nearness;
       add(slopes.edge + first_ + tap(i), -near_by * (of_nearer[i] * clamp01(to_near) + of_farther[i] * clamp01(to_far)));
-      const vec of_ends = 4.0f * weight * (only(is_within(to_near), of_nearer[i]) - only(is_within(to_far), of_farther[i]));
+      const vec of_ends = 4.0f * weight * (select(is_within(to_near), of_nearer[i]) - select(is_within(to_far), of_farther[i]));
       const vec of_nearness = (of_ends + of_covered_ * small_[i] * per_counted_) / gap_;
       add(slopes.coc + in_coc, -of_nearness);
       of_far_ += of_nearness;
@@ -588,7 +609,7 @@ template <typename Body>
 void each_mixed(const Frame &frame, int y0, int x0, const Window &w, const Body &body) {
   for (int y = 0; y < std::min(BLOCK, frame.height - y0); y++)
     for (int x = 0; x < std::min(BLOCK, frame.width - x0); x += LANES) {
-      const ivec beside = (load<vec>(w.edge + (y + RIM) * PITCH + x + RIM) > vec{}) & (counting() < (float)(frame.width - x0 - x));
+      const ivec beside = (load<vec>(w.edge + (y + RIM) * PITCH + x + RIM) > vec{}) & (iota() < (float)(frame.width - x0 - x));
       if (any_of(beside)) body(y, x, beside);
     }
 }
@@ -634,7 +655,7 @@ void back_of_block(const Frame &frame, int by, int bx, Window &w, const float *f
       const int at = i * PITCH + j;
       const Ends ends(w, at, frame.valid);
       const vec rise = (ends.far - ends.near) * (1.0f / EDGE_PX) - 1.0f;
-      const vec slope = only(is_within(rise) & (load<vec>(w.edge + at) > vec{}), load<vec>(slopes.edge + at) * (1.0f / EDGE_PX));
+      const vec slope = select(is_within(rise) & (load<vec>(w.edge + at) > vec{}), load<vec>(slopes.edge + at) * (1.0f / EDGE_PX));
       if (any_of(slope != vec{})) ends.back(w, at, frame.valid, -slope, slope, slopes.coc);
     }
   const auto add_window = [&](const float *window, int size, int margin, float *to) {
@@ -773,7 +794,7 @@ void attribute_emitter(Job &job, int y, int x, float least_limit, const float *f
     if (!(sureness > 0)) continue;
     const Block block = s.make_block(i);
     const float coc = around.measure_emitter(light, surface), floor = *std::max_element(surface.begin(), surface.end());
-    const float share = clamp((light / around.scale - floor) / std::max(around.top - floor, 1e-12f), 1.0f - MOST_WEIGHT, MOST_WEIGHT);
+    const float share = std::clamp((light / around.scale - floor) / std::max(around.top - floor, 1e-12f), 1.0f - MOST_WEIGHT, MOST_WEIGHT);
     // an emitter seen behind a surface is not in front of it
     if (side == IN_FRONT) sureness *= 1.0f - around.certainty_beyond(coc, BEHIND, 0.5f, light, limit);
     const float given = std::max(side == IN_FRONT ? sureness : 2.0f * sureness - 1.0f, 0.0f);
@@ -903,7 +924,7 @@ void Job::add_background() {
       const bool mixed = surfaces.row(1, y, x, other.data(), other_coc, weight);
       bool known = std::isfinite(scene.coc[1][at]);
       for (int c = 0; c < channels; c++) known &= std::isfinite(scene.light[1][c * area + at]);
-      const float here = surfaces.coc[at], there = clamp(scene.coc[1][at], low, high), apart = clamp01(there - here - SAME_PX);
+      const float here = surfaces.coc[at], there = std::clamp(scene.coc[1][at], low, high), apart = clamp01(there - here - SAME_PX);
       // a given background replaces the farther surface of a mixed pixel
       const float share = mixed && *other_coc < here ? *weight : 0.0f;
       for (int c = 0; c < channels; c++) {

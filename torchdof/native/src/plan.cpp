@@ -1,11 +1,21 @@
 // Circles of confusion of a frame, and the positions of its layers on the blur axis; formulas in optics/camera.py,
 // render/layers/layer_cocs.py and render/layers/plan.py.
-#include "engine.h"
-
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstdlib>
+#include <cstring>
 #include <numeric>
+#include <vector>
 
+#include "api.h"
+#include "blur_axis.h"
 #include "constants/layer_cocs.h"
 #include "constants/plan.h"
+#include "entry.h"
+#include "extremes.h"
+#include "simd.h"
+#include "threads.h"
 
 namespace torchdof {
 namespace {
@@ -77,7 +87,7 @@ std::vector<double> border_nodes(std::vector<float> places) {
 // 1 / s - 1 / z, exactly 0 at z = s.
 vec dioptres_behind(vec z, float s) {
   const vec apart = 1 / s - 1 / z;
-  return std::isfinite(s) ? (z < all(INFINITY) ? (z - s) / z / s : apart) : apart;
+  return std::isfinite(s) ? (z < INFINITY ? (z - s) / z / s : apart) : apart;
 }
 
 // Radius above which a kernel is constant within the frame.
@@ -88,13 +98,13 @@ void coc_of_depth(const float *depth, int64_t count, float scale, float nearest,
   torchdof::parallel(threads, (int)((count + PART - 1) / PART), nullptr, [&](int part, int) {
     const auto coc_at = [&](vec z) {
       vec dioptres = dioptres_behind(z, nearest);
-      if (nearest != farthest) dioptres = least(dioptres, vec{}) + most(dioptres_behind(z, farthest), vec{});
-      return z > vec{} ? scale * dioptres : all(NAN);
+      if (nearest != farthest) dioptres = min(dioptres, vec{}) + max(dioptres_behind(z, farthest), vec{});
+      return z > vec{} ? scale * dioptres : broadcast(NAN);
     };
     int64_t i = part * PART;
     const int64_t end = std::min(count, i + PART);
     for (; i + LANES <= end; i += LANES) store(out + i, coc_at(load<vec>(depth + i)));
-    for (; i < end; i++) out[i] = coc_at(all(depth[i]))[0];
+    for (; i < end; i++) out[i] = coc_at(broadcast(depth[i]))[0];
   });
 }
 
@@ -106,17 +116,17 @@ double mean_change(const float *coc, int height, int width, int threads) {
   std::vector<double> changes(height);
   torchdof::parallel(threads, height, nullptr, [&](int y, int) {
     const float *row = coc + (size_t)y * width, *above = y ? row - width : row;
-    auto known = [&](vec v) { return least(most(v == v ? v : vec{}, all(-reach)), all(reach)); };
+    auto known = [&](vec v) { return min(max(v == v ? v : vec{}, broadcast(-reach)), broadcast(reach)); };
     double sums = 0;
     int x = 0;
     for (; x + LANES < width; x += LANES) {
       const vec here = known(load<vec>(row + x));
-      sums += sum(size_of(here - known(load<vec>(above + x))) + size_of(known(load<vec>(row + x + 1)) - here));
+      sums += reduce_add(abs(here - known(load<vec>(above + x))) + abs(known(load<vec>(row + x + 1)) - here));
     }
     for (; x < width; x++) {
-      const float here = known(all(row[x]))[0];
-      sums += std::fabs(here - known(all(above[x]))[0]);
-      if (x + 1 < width) sums += std::fabs(known(all(row[x + 1]))[0] - here);
+      const float here = known(broadcast(row[x]))[0];
+      sums += std::fabs(here - known(broadcast(above[x]))[0]);
+      if (x + 1 < width) sums += std::fabs(known(broadcast(row[x + 1]))[0] - here);
     }
     changes[y] = sums;
   });
@@ -135,7 +145,7 @@ std::vector<double> plan(const float *coc, int maps, int height, int width, doub
     for (int64_t i = 0; i < maps * area; i++) low = std::min(low, coc[i]), high = std::max(high, coc[i]);
   }
   const float reach = reach_of(height, width);
-  auto place = [&](float c) { return axis(std::isnan(c) ? 0.0f : clamp(c, -reach, reach), -INFINITY, INFINITY); };
+  auto place = [&](float c) { return axis(std::isnan(c) ? 0.0f : std::clamp(c, -reach, reach), -INFINITY, INFINITY); };
   const double nearest = place(low), farthest = place(high);
   double widest = std::max({-(double)coc_at(nearest), (double)coc_at(farthest), 1.0});  // px
   if (SMALL_RADII * widest > std::min(height, width)) {  // the mean of the widest pixels, 1 of FEW, so that a single one does not decide

@@ -1,11 +1,30 @@
 // Rules of the picture, each in one place: its formula, the Python function that defines it, and for the gradients its
 // derivative. A rule without its limits to [0, 1] is named `unlimited`: the derivative is that of the limited one where
 // `within` holds, and 0 elsewhere. Templates are for a float and for a vector of pixels; a layer is any type with the ends and
-// slopes of its ramps.
+// slopes of its ramps. Of the standard library only cstdint is included.
 #pragma once
+#include "constants/composite.h"
+#include "constants/disocclusion.h"
+#include "constants/frame.h"
+#include "constants/layer_weights.h"
 #include "numbers.h"
 
 namespace torchdof {
+
+// Constants of Python modules, which give their meanings, units and effects; here with the type of the computations.
+constexpr float KNOWN = constants::composite::KNOWN;
+constexpr float BEHIND_PX = constants::disocclusion::BEHIND_PX;
+constexpr float OWN_SLOPE = constants::disocclusion::OWN_SLOPE;
+constexpr float FOOT = constants::layer_weights::FOOT;
+constexpr float HIDDEN_WEIGHT = constants::frame::HIDDEN_WEIGHT;
+constexpr float HIDING_SHARE = constants::frame::HIDING_SHARE;
+constexpr float LEAST_PASSING = constants::frame::LEAST_PASSING;
+constexpr float CONTINUES_FROM = constants::frame::CONTINUES_FROM;
+constexpr float AT_FOCUS = constants::frame::AT_FOCUS;
+constexpr float OFF_FOCUS = constants::frame::OFF_FOCUS;
+constexpr float BARELY_BLURRED = constants::frame::BARELY_BLURRED;
+constexpr float COUNTED = constants::frame::COUNTED;
+constexpr float SEEN_FROM = constants::frame::SEEN_FROM;
 
 // Whether 0 <= v <= 1.
 template <typename V>
@@ -17,10 +36,10 @@ inline auto within(V v) {
 // render/surfaces/disocclusion.py, end_of_surface.
 template <typename V>
 inline V end_of_surface(V coc) {
-  return coc + most(most(coc, -coc) * OWN_SLOPE - BEHIND_PX, V{});
+  return coc + max(max(coc, -coc) * OWN_SLOPE - BEHIND_PX, V{});
 }
 inline float slope_of_end(float coc) {
-  return OWN_SLOPE * most(coc, -coc) >= BEHIND_PX ? 1.0f + (coc < 0 ? -OWN_SLOPE : OWN_SLOPE) : 1.0f;
+  return OWN_SLOPE * max(coc, -coc) >= BEHIND_PX ? 1.0f + (coc < 0 ? -OWN_SLOPE : OWN_SLOPE) : 1.0f;
 }
 
 // Confidence that a surface whose coc is larger by d is another surface: clamp(d - BEHIND_PX + 1/2, 0, 1).
@@ -48,8 +67,8 @@ inline V is_read(V size_px, float least_px) {
 constexpr float SLOPE = 1 / (1 - FOOT / 2);  // of the straight part
 template <typename V>
 inline V eased(V v) {
-  const V foot = least(v, V{} + FOOT);
-  return most(1.0f - SLOPE * (1.0f - v), SLOPE / (2 * FOOT) * foot * foot);
+  const V foot = min(v, V{} + FOOT);
+  return max(1.0f - SLOPE * (1.0f - v), SLOPE / (2 * FOOT) * foot * foot);
 }
 // The ramp clamp(v, 0, 1), eased or not, and its derivative.
 template <typename V>
@@ -132,7 +151,7 @@ inline V slope_of_stands_in(V place) {  // 0 where it is 0
   return stands_in(place) > V{} ? slope : V{};
 }
 template <typename V>
-inline V seen(V weight) { return most(weight - SEEN_FROM, V{}); }
+inline V seen(V weight) { return max(weight - SEEN_FROM, V{}); }
 template <typename V>
 inline V slope_of_seen(V weight) { return weight > SEEN_FROM ? V{} + 1.0f : V{}; }
 template <typename V>
@@ -145,7 +164,7 @@ inline V slope_of_counts(V weight) { return within(unlimited_counts(weight)) ? V
 // The normalizer of a layer, its weight w plus the weight v behind it, is raised where it is small: with l = max(KNOWN - w -
 // v, 0), by l^2 / (2 KNOWN), whose derivative by w or v is -l / KNOWN. render/layers/composite.py, raised.
 template <typename V>
-inline V lacking(V weight, V behind = V{}) { return most(V{} + KNOWN - weight - behind, V{}); }
+inline V lacking(V weight, V behind = V{}) { return max(V{} + KNOWN - weight - behind, V{}); }
 template <typename V>
 inline V raise(V lacking) { return lacking * lacking * (0.5f / KNOWN); }
 template <typename V>
