@@ -13,7 +13,6 @@
 #include "composite.h"
 #include "constants/checksum.h"
 #include "constants/exposure.h"
-#include "constants/native.h"
 #include "disocclusion.h"
 #include "entry.h"
 #include "extremes.h"
@@ -233,8 +232,6 @@ int32_t torchdof_ends(const float *values, int64_t count, int32_t threads, float
   return torchdof::guarded([&] { torchdof::find_ends(values, count, threads, low, high); });
 }
 
-int64_t torchdof_interface(void) {
-  return (int64_t)torchdof::constants::native::REVISION << 32 | (int64_t)sizeof(torchdof_scene) << 16 | (int64_t)(sizeof(torchdof_map) + sizeof(torchdof_layers) + sizeof(torchdof_level));
-}
+int64_t torchdof_interface(void) { return torchdof::constants::checksum::INTERFACE; }
 
 int64_t torchdof_constants(void) { return torchdof::constants::checksum::ALL; }

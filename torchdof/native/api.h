@@ -201,8 +201,8 @@ TORCHDOF_API int32_t torchdof_continued(const float *const *maps, int32_t surfac
 // Smallest and largest value; both NaN if any value is NaN.
 TORCHDOF_API int32_t torchdof_ends(const float *values, int64_t count, int32_t threads, float *low, float *high);
 
-// Version of this interface, for the caller to check first: sizes of its structures and, in the upper half,
-// _REVISION of native/__init__.py, which increases with every other change of this file.
+// Checksum of the text of this file that it was compiled with. The caller compares it with that of the file from which it
+// takes the structures and functions, before it calls any other function.
 TORCHDOF_API int64_t torchdof_interface(void);
 
 // Checksum of the constants of Python modules that it was compiled with; cmake/constants.py computes that of the sources.
