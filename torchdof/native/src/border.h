@@ -11,30 +11,33 @@ namespace torchdof {
 
 struct Job;
 
-// Sums of values [length, count] of pixels over windows along a line; each level has a width, twice that of the level before.
-// Pixels on surfaces nearer than that of the window's middle are left out. places: of the pixels, in bins. border.cpp
+// Sums of values [length, count] of pixels over windows along a line; each level has a width, twice that of the level
+// before. Pixels on surfaces nearer than that of the window's middle are left out. places: of the pixels, in bins.
+// border.cpp
 class WindowSums {
  public:
   static constexpr int WIDTH = constants::border::WIDTH, BINS = constants::border::BINS;
   WindowSums(int length, int count, const double *values, const double *places);
-  // Computes the sums [length, count] of a level and, unless null, their derivatives by the place of the window's middle.
+  // Computes the sums [length, count] of a level and, unless null, their derivatives by the place of the window's
+  // middle.
   void sum(int level, double *sums, double *slopes = nullptr) const;
 
  private:
   int length_, count_;
   std::vector<int> bin_;      // lower of each pixel's two bins
   std::vector<double> part_;  // weight of the upper one
-  Buffer<double> until_;      // sums from the line's start on, of each bin and all farther ones [length + 1, count, BINS]
+  Buffer<double> until_;  // sums from the line's start on, of each bin and all farther ones [length + 1, count, BINS]
 };
 
 // The pixels of one surface along one side of the frame; border.cpp
 struct BorderLine {
   BorderLine(int length, int channels)
-      : image_x(length), x(length), surface(length), places(length), values((size_t)length * (channels + 1)), shares(length, 1.0f) {}
+      : image_x(length), x(length), surface(length), places(length), values((size_t)length * (channels + 1)),
+        shares(length, 1.0f) {}
   void set_light(int at, const float *const *light, int channels, float weight, float limit);
   void find_places();
   // Adds gradients by x and image_x, whose pixels lie `step` values apart.
-  void gradient(const double *of_places, ptrdiff_t step, float *of_x, float *of_image_x) const;
+  void gradient(const double *d_places, ptrdiff_t step, float *d_x, float *d_image_x) const;
 
   std::vector<double> image_x, x;       // positions on the blur axis, of the image and of the surface
   std::vector<double> surface, places;  // accumulated steps of the image; place of each pixel in bins
@@ -43,8 +46,8 @@ struct BorderLine {
   double least, most, per_bin;          // smallest and largest accumulated steps; bins for each
 };
 
-// Level l of the means beyond the border is for a distance of 2^l pixels: the level at or below a distance, the fraction of
-// the way to the next one, and the number of levels for distances up to this one.
+// Level l of the means beyond the border is for a distance of 2^l pixels: the level at or below a distance, the
+// fraction of the way to the next one, and the number of levels for distances up to this one.
 struct Octave {
   int level = 0;
   float part;
@@ -104,7 +107,8 @@ class Border {
   }
   float mean(Side side, int surface, int channel, int distance, int at) const {
     const float part = part_of_[distance];
-    const float *nearer = means_[side].data() + start(side, surface, channel, level_of_[distance]) + at, *farther = nearer + length(side);
+    const float *nearer = means_[side].data() + start(side, surface, channel, level_of_[distance]) + at,
+                *farther = nearer + length(side);
     return *nearer + part * (*farther - *nearer);
   }
   int height_ = 0, width_ = 0, channels_ = 0, levels_ = 0;

@@ -1,5 +1,5 @@
-// Composites the layers from far to near, as described in render/layers/composite.py. With m a layer's share of each pixel and
-// M the share at or behind the layer (its normalizer), K its kernel and I its light:
+// Composites the layers from far to near, as described in render/layers/composite.py. With m a layer's share of each
+// pixel and M the share at or behind the layer (its normalizer), K its kernel and I its light:
 //
 //   colour = K * (m I) / K * M,   coverage = K * m / K * M,   picture = colour + (1 - coverage) picture
 //
@@ -33,7 +33,7 @@ namespace {
 constexpr float LEAST = constants::composite::LEAST;
 constexpr float COVERED = 1e-6f;  // an uncovered part up to this is a rounding error
 constexpr int TILE_PIXELS = TILE * TILE;
-constexpr int PART = 16;  // side in pixels of the parts of a coarse canvas that are skipped if empty
+constexpr int PART = 16;                // side in pixels of the parts of a coarse canvas that are skipped if empty
 constexpr float EVEN_SQUARED = 1e-12f;  // square of the difference from 1 up to which a normalizer counts as 1
 
 // Consecutive layers of one resolution, composited together. Under occlusion a coarse run lies on one side of the
@@ -87,10 +87,10 @@ struct MaskedKernels {
 struct Scratch {
   std::vector<float> memory;
   std::vector<float *> light, coc, weight;  // of each surface (light: [surfaces, channels])
-  std::vector<float *> term;    // of one layer: light, share, normalizer
-  std::vector<float *> canvas;  // light and coverage of a tile
-  float *traced;                // light of highlights in a tile
-  float *farther;  // weight of surfaces that lie wholly behind a coarse layer
+  std::vector<float *> term;                // of one layer: light, share, normalizer
+  std::vector<float *> canvas;              // light and coverage of a tile
+  float *traced;                            // light of highlights in a tile
+  float *farther;                           // weight of surfaces that lie wholly behind a coarse layer
   // column marks (see `mark`) of each row: where the layer has a share, where its normalizer exceeds the share (so that
   // coverage is below 1), and where the normalizer differs from 1
   std::vector<uint32_t> occupied, partial, varying, every;
@@ -163,10 +163,12 @@ class Composite {
       downsampled_.emplace_back(new Downsampled(job_, run.scale, margin));
       downsampled_.back()->take(job_, index_, border_);
     }
-    job_.parallel((int)coarse.size(), [&](int i, int worker) { coarse_tile(runs_[coarse[i].first], coarse[i].second, scratch(worker)); });
+    job_.parallel((int)coarse.size(),
+                  [&](int i, int worker) { coarse_tile(runs_[coarse[i].first], coarse[i].second, scratch(worker)); });
     if (!job_.rays.empty()) sort_rays();
     const int columns = ceil_div(W_, TILE);
-    job_.parallel(ceil_div(H_, TILE) * columns, [&](int i, int worker) { tile(i / columns, i % columns, scratch(worker)); });
+    job_.parallel(ceil_div(H_, TILE) * columns,
+                  [&](int i, int worker) { tile(i / columns, i % columns, scratch(worker)); });
   }
 
  private:
@@ -197,8 +199,8 @@ class Composite {
 
   // Finds the node before each pixel of each surface, and the layers that occur in each cell of CELL x CELL pixels.
   //
-  // Fills a block at once if it shows one surface that lies between two neighbouring nodes. In other blocks, compares the
-  // places of a cell's pixels with the nodes between the smallest and the largest one.
+  // Fills a block at once if it shows one surface that lies between two neighbouring nodes. In other blocks, compares
+  // the places of a cell's pixels with the nodes between the smallest and the largest one.
   void index() {
     index_.words = (N_ + 63) / 64;
     index_.rows = ceil_div(H_, CELL);
@@ -208,7 +210,8 @@ class Composite {
     index_.mixed.assign(index_.single.size(), 0);
     for (int i = 0; i < s_.count; i++) index_.intervals.emplace_back(s_.area());
     auto node_before = [&](float place) {
-      const auto after = std::upper_bound(layers_.begin() + 1, layers_.end(), place, [](float at, const Layer &l) { return at < l.at; });
+      const auto after = std::upper_bound(layers_.begin() + 1, layers_.end(), place,
+                                          [](float at, const Layer &l) { return at < l.at; });
       return (int)(after - layers_.begin()) - 1;
     };
     auto mark = [&](uint64_t *bits, float place, int k) {
@@ -220,12 +223,15 @@ class Composite {
       std::vector<const float *> light(C_);
       const float *coc, *weight;
       for (int bx = 0; bx < s_.block_columns; bx++) {
-        const int block = by * s_.block_columns + bx, y_end = std::min(H_, (by + 1) * BLOCK), x_end = std::min(W_, (bx + 1) * BLOCK);
+        const int block = by * s_.block_columns + bx, y_end = std::min(H_, (by + 1) * BLOCK),
+                  x_end = std::min(W_, (bx + 1) * BLOCK);
         if (!s_.full_planes() && !s_.has_block(block)) {  // one surface, usually between two neighbouring nodes
           const float low = index_.place(job_.block_low[block]), high = index_.place(job_.block_high[block]);
           const int k = node_before(low);
           if (k == node_before(high)) {
-            for (int y = by * BLOCK; y < y_end; y++) std::fill(&index_.intervals[0][(size_t)y * W_ + bx * BLOCK], &index_.intervals[0][(size_t)y * W_ + x_end - 1] + 1, (uint16_t)k);
+            for (int y = by * BLOCK; y < y_end; y++)
+              std::fill(&index_.intervals[0][(size_t)y * W_ + bx * BLOCK],
+                        &index_.intervals[0][(size_t)y * W_ + x_end - 1] + 1, (uint16_t)k);
             for (int row = by * CELLS; row * CELL < y_end && row < (by + 1) * CELLS; row++)
               for (int column = bx * CELLS; column * CELL < x_end && column < (bx + 1) * CELLS; column++) {
                 const size_t cell = (size_t)row * index_.columns + column;
@@ -246,7 +252,8 @@ class Composite {
             for (int i = 0; i < s_.count; i++) {
               // places: of all pixels; shown: of pixels with weight. A row cut off by the frame repeats its last pixel.
               float places[CELL * CELL], shown[CELL * CELL], cut_coc[CELL], cut_weight[CELL];
-              vec lows = broadcast(NEVER), highs = broadcast(-NEVER), least_weight = broadcast(1.0f), most_weight = {}, farther_weight = {};
+              vec lows = broadcast(NEVER), highs = broadcast(-NEVER), least_weight = broadcast(1.0f), most_weight = {},
+                  farther_weight = {};
               bool there = true;
               for (int y = 0; y < rows; y++) {
                 if (!(there = s_.row(i, row * CELL + y, x0, light.data(), coc, weight))) break;
@@ -256,7 +263,8 @@ class Composite {
                 }
                 if (n < CELL) coc = cut_coc, weight = weight ? cut_weight : nullptr;
                 for (int x = 0; x < CELL; x += LANES) {
-                  const vec its_coc = load<vec>(coc + x), place = index_.place(its_coc), w = weight ? load<vec>(weight + x) : broadcast(1.0f);
+                  const vec its_coc = load<vec>(coc + x), place = index_.place(its_coc),
+                            w = weight ? load<vec>(weight + x) : broadcast(1.0f);
                   const auto weighs = w != vec{};
                   store(places + y * CELL + x, place);
                   store(shown + y * CELL + x, weighs ? place : broadcast(NEVER));
@@ -274,9 +282,11 @@ class Composite {
               if (i) index_.mixed[cell] = reduce_max(farther_weight) > HIDDEN_WEIGHT;
               uint16_t *intervals = &index_.intervals[i][(size_t)row * CELL * W_ + x0];
               const bool any = any_positive(most_weight);
-              const int first = any ? node_before(reduce_min(lows)) : 0, last = any ? node_before(reduce_max(highs)) : 0;
+              const int first = any ? node_before(reduce_min(lows)) : 0,
+                        last = any ? node_before(reduce_max(highs)) : 0;
               if (first == last) {
-                for (int y = 0; y < rows; y++) std::fill(intervals + (size_t)y * W_, intervals + (size_t)y * W_ + n, (uint16_t)first);
+                for (int y = 0; y < rows; y++)
+                  std::fill(intervals + (size_t)y * W_, intervals + (size_t)y * W_ + n, (uint16_t)first);
                 if (any) mark(bits, reduce_min(lows), first), mark(bits, reduce_max(highs), first);
                 continue;
               }
@@ -290,8 +300,10 @@ class Composite {
                 }
                 for (int x = 0; x < n; x++) intervals[(size_t)y * W_ + x] = (uint16_t)nodes[x];
               }
-              for (int k = first; k <= std::min(last + 1, N_ - 1); k++) {  // layer k occurs between nodes k - 1 and k + 1
-                const vec before = broadcast(k == first ? -NEVER : layers_[k - 1].at), after = broadcast(k > last || k == N_ - 1 ? NEVER : layers_[k + 1].at);
+              for (int k = first; k <= std::min(last + 1, N_ - 1);
+                   k++) {  // layer k occurs between nodes k - 1 and k + 1
+                const vec before = broadcast(k == first ? -NEVER : layers_[k - 1].at),
+                          after = broadcast(k > last || k == N_ - 1 ? NEVER : layers_[k + 1].at);
                 ivec found = {};
                 for (int j = 0; j < rows * CELL; j += LANES) {
                   const vec place = load<vec>(shown + j);
@@ -354,13 +366,15 @@ class Composite {
     }
     for (int c = 0; c < C_ + E_; c++)
       for (int y = 0; y < rows; y++)
-        memcpy(&run.canvas[((size_t)c * run.rows + tile_y + y) * run.columns + tile_x], b.canvas[c] + y * TILE, columns * sizeof(float));
+        memcpy(&run.canvas[((size_t)c * run.rows + tile_y + y) * run.columns + tile_x], b.canvas[c] + y * TILE,
+               columns * sizeof(float));
     for (int y = 0; y < rows; y += PART)
       for (int x = 0; x < columns; x += PART) {
         vec most_cover = {};
         for (int e = 0; e < E_; e++)
           for (int i = 0; i < PART; i++)
-            for (int j = 0; j < PART; j += LANES) most_cover = max(most_cover, load<vec>(b.canvas[C_ + e] + (y + i) * TILE + x + j));
+            for (int j = 0; j < PART; j += LANES)
+              most_cover = max(most_cover, load<vec>(b.canvas[C_ + e] + (y + i) * TILE + x + j));
         run.used[(size_t)(tile_y + y) / PART * run.part_columns + (tile_x + x) / PART] = any_positive(most_cover);
       }
   }
@@ -389,7 +403,8 @@ class Composite {
         const float *values = &pieces.values[(size_t)i * stride];
         if (node >= L) b.farther[(size_t)y * pitch_ + x] += values[0];
         if (node < 0 || node >= L) continue;
-        p.unsorted.push_back({values, (uint16_t)y, (uint16_t)x, (uint16_t)node, (pieces.node[i] & Pieces::NORMALIZER_ONLY) != 0});
+        p.unsorted.push_back(
+            {values, (uint16_t)y, (uint16_t)x, (uint16_t)node, (pieces.node[i] & Pieces::NORMALIZER_ONLY) != 0});
         p.start[node + 1]++;
       }
     }
@@ -400,12 +415,14 @@ class Composite {
   }
 
   // The terms of layer k in a window. Adds the weight between node k and the next to `farther`.
-  void downsampled_terms(const Run &run, const Downsampled &d, int k, int top, int left, int height, int width, int spare, Scratch &b) {
+  void downsampled_terms(const Run &run, const Downsampled &d, int k, int top, int left, int height, int width,
+                         int spare, Scratch &b) {
     const int C = C_;
     const vec at = broadcast((float)k), before = broadcast((float)(k - 1));
     for (int y = spare; y < height - spare; y++) {
       const size_t to = (size_t)y * pitch_;
-      const float *node = d.row(0, top + y) + left, *one = d.row(1, top + y) + left, *two = d.row(C + 2, top + y) + left;
+      const float *node = d.row(0, top + y) + left, *one = d.row(1, top + y) + left,
+                  *two = d.row(C + 2, top + y) + left;
       float *share = b.term[C] + to, *normalizer = b.term[C + 1] + to;
       uint32_t occupied = 0, partial = 0, varying = 0;
       for (int x0 = 0; x0 < width; x0 += MARKED) {
@@ -418,7 +435,8 @@ class Composite {
           store(share + x, its_share);
           some = max(some, its_share);
           if (!over_) continue;
-          const vec its_normalizer = (n >= at ? w : ramp) + load<vec>(b.farther + to + x), from_one = its_normalizer - 1.0f;
+          const vec its_normalizer = (n >= at ? w : ramp) + load<vec>(b.farther + to + x),
+                    from_one = its_normalizer - 1.0f;
           store(normalizer + x, its_normalizer);
           more = max(more, its_normalizer - its_share);
           other = max(other, from_one * from_one - EVEN_SQUARED);
@@ -481,8 +499,8 @@ class Composite {
     }
   }
 
-  // The terms of layer k for surfaces that cover each other, in rows from `first` and columns from `from` of a window: computes
-  // each row of pixels and averages over s x s.
+  // The terms of layer k for surfaces that cover each other, in rows from `first` and columns from `from` of a window:
+  // computes each row of pixels and averages over s x s.
   void block_means(int k, int s, int top, int left, int height, int width, int first, int from, Scratch &b) {
     const float each = 1.0f / (s * s);
     const int n = width * s;
@@ -506,8 +524,10 @@ class Composite {
   }
 
   // Reads a row of all surfaces, extended beyond the frame: light [surfaces, channels], place on the blur axis, weight.
-  void read_row(int y, int x0, int n, bool single, float *const *light, float *const *coc, float *const *weight, Scratch &b) {
-    const int at_y = std::clamp(y, 0, H_ - 1), first = std::clamp(x0, 0, W_ - 1), last = std::clamp(x0 + n - 1, 0, W_ - 1);
+  void read_row(int y, int x0, int n, bool single, float *const *light, float *const *coc, float *const *weight,
+                Scratch &b) {
+    const int at_y = std::clamp(y, 0, H_ - 1), first = std::clamp(x0, 0, W_ - 1),
+              last = std::clamp(x0 + n - 1, 0, W_ - 1);
     const int before = std::max(0, std::min(n, -x0)), after = std::max(0, std::min(n, x0 + n - W_));
     for (int i = 0; i < (single ? 1 : s_.count); i++) {
       const float *from_coc, *from_weight;
@@ -549,7 +569,8 @@ class Composite {
         extend(row);
         for (int x = 0; x < before; x++) row[x] = border_.light(i, c, y, x0 + x, row[x]);
         for (int x = n - after; x < n; x++) row[x] = border_.light(i, c, y, x0 + x, row[x]);
-        if (y != at_y && before + after < n) border_.continue_row(i, c, y, x0 + before, n - before - after, row + before);
+        if (y != at_y && before + after < n)
+          border_.continue_row(i, c, y, x0 + before, n - before - after, row + before);
       }
       extend(coc[i]);
       extend(weight[i]);
@@ -561,7 +582,8 @@ class Composite {
   // behind the layer; g: its share at the layer. Each surface in turn takes its part of what nearer surfaces at the
   // layer left. The normalizer is the share that surfaces in front of the layer leave visible, where any surface behind
   // them is known.
-  void row_terms(const Layer &l, int n, const float *const *light, const float *const *place, const float *const *weight, float *const *term) const {
+  void row_terms(const Layer &l, int n, const float *const *light, const float *const *place,
+                 const float *const *weight, float *const *term) const {
     std::vector<vec> m(s_.count);  // share of each surface
     for (int i = 0; i < n; i += LANES) {
       vec left = broadcast(1.0f), unknown = left, normalizer = left, share = {};
@@ -594,7 +616,8 @@ class Composite {
         const float from_one = normalizer[x] - 1.0f;
         b.occupied[y] |= share[x] > 0 ? mark(x) : 0;
         if (!over_) continue;
-        b.partial[y] |= normalizer[x] != share[x] ? mark(x) : 0;  // may also be smaller, where a share is below HIDING_SHARE
+        b.partial[y] |=
+            normalizer[x] != share[x] ? mark(x) : 0;  // may also be smaller, where a share is below HIDING_SHARE
         b.varying[y] |= from_one * from_one > EVEN_SQUARED ? mark(x) : 0;
       }
     }
@@ -610,10 +633,12 @@ class Composite {
     for (int i = 0; i < block_rows * block_columns; i++) {
       const int y0 = floor_div(top, BLOCK) * BLOCK + i / block_columns * BLOCK, x0 = left + i % block_columns * BLOCK;
       const bool inside = y0 >= 0 && x0 >= 0 && y0 + BLOCK <= H_ && x0 + BLOCK <= W_;
-      const int y_in = std::clamp(y0, 0, (s_.block_rows - 1) * BLOCK), x_in = std::clamp(x0, 0, (s_.block_columns - 1) * BLOCK);
+      const int y_in = std::clamp(y0, 0, (s_.block_rows - 1) * BLOCK),
+                x_in = std::clamp(x0, 0, (s_.block_columns - 1) * BLOCK);
       WindowBlock w;
       uint64_t *layers = &b.block_layers[(size_t)i * index_.words];
-      const bool single = around(y_in / CELL, y_in / CELL + BLOCK / CELL - 1, x_in / CELL, x_in / CELL + BLOCK / CELL - 1, layers);
+      const bool single =
+          around(y_in / CELL, y_in / CELL + BLOCK / CELL - 1, x_in / CELL, x_in / CELL + BLOCK / CELL - 1, layers);
       w.layers = layers;
       w.count = single ? 1 : s_.count;
       w.top = std::max(y0 - top, 0);
@@ -624,7 +649,7 @@ class Composite {
       const int first_row = top + w.top;
       for (int j = 0; j < w.count && inside; j++) {
         WindowBlock::Surface &of = w.surfaces[j];
-        const float *from;
+        const float *from = nullptr;
         s_.row(j, first_row, x0, b.pointers.data(), from, of.weight);
         const bool in_block = s_.has_block(first_row / BLOCK * s_.block_columns + x0 / BLOCK);
         of.light = b.pointers[0];
@@ -634,7 +659,8 @@ class Composite {
         if (single) of.weight = nullptr;
         if (!over_ && !has_fine(layers)) continue;  // no layer needs the places
         for (int y = w.top; y < w.top + w.rows; y++, from += j ? BLOCK : W_)
-          for (int x = 0; x < BLOCK; x += LANES) store(b.coc[j] + (size_t)y * pitch_ + w.column + x, index_.place(load<vec>(from + x)));
+          for (int x = 0; x < BLOCK; x += LANES)
+            store(b.coc[j] + (size_t)y * pitch_ + w.column + x, index_.place(load<vec>(from + x)));
       }
       if (!inside) {
         for (int y = w.top; y < w.top + w.rows; y++) {
@@ -678,8 +704,9 @@ class Composite {
       if (has(w.layers, k)) {
         w.clear = false;
         w.normalizer = WindowBlock::STALE;
-        const auto terms = C_ == 3 ? (w.count == 1 ? &Composite::block_terms<3, 1, true> : &Composite::block_terms<3, 2, true>)
-                                   : (w.count == 1 ? &Composite::block_terms<0, 1, true> : &Composite::block_terms<0, 2, true>);
+        const auto terms =
+            C_ == 3 ? (w.count == 1 ? &Composite::block_terms<3, 1, true> : &Composite::block_terms<3, 2, true>)
+                    : (w.count == 1 ? &Composite::block_terms<0, 1, true> : &Composite::block_terms<0, 2, true>);
         (this->*terms)(layers_[k], w, y0, y1, x0, x1, &b.partial[w.top], &b.varying[w.top], b);
         continue;
       }
@@ -719,10 +746,11 @@ class Composite {
     }
   }
 
-  // The terms of layer l in columns x0 to x1 of a block and rows y0 to y1 of the window; only the normalizer, if the layer
-  // does not occur in the block. partial, varying: marks of the block's rows.
+  // The terms of layer l in columns x0 to x1 of a block and rows y0 to y1 of the window; only the normalizer, if the
+  // layer does not occur in the block. partial, varying: marks of the block's rows.
   template <int CHANNELS, int COUNT, bool OCCURS>
-  void block_terms(const Layer &l, const WindowBlock &w, int y0, int y1, int x0, int x1, uint32_t *partial, uint32_t *varying, Scratch &b) {
+  void block_terms(const Layer &l, const WindowBlock &w, int y0, int y1, int x0, int x1, uint32_t *partial,
+                   uint32_t *varying, Scratch &b) {
     const int C = CHANNELS ? CHANNELS : C_;
     for (int y = y0; y < y1; y++) {
       const size_t row = y - w.top, at = (size_t)y * pitch_ + w.column;
@@ -748,7 +776,10 @@ class Composite {
           for (int c = 0; c < C; c++) {
             vec sum = {};
             for (int j = 0; j < COUNT; j++)
-              if (has_light[j]) sum += load<vec>(w.surfaces[j].light + c * w.surfaces[j].channel + row * w.surfaces[j].light_pitch + x) * surface_share[j];
+              if (has_light[j])
+                sum +=
+                    load<vec>(w.surfaces[j].light + c * w.surfaces[j].channel + row * w.surfaces[j].light_pitch + x) *
+                    surface_share[j];
             store(b.term[c] + at + x, sum);
           }
           b.occupied[y] |= any_positive(share) ? bit : 0;
@@ -792,7 +823,8 @@ class Composite {
     const float per = per_half_diagonal(scene);
     const float y = (((block_row + 0.5f) * FieldMask::ROWS - before) * l.scale - 0.5f * H_) * per;
     const float x = (((block_column + 0.5f) * FieldMask::COLUMNS - before) * l.scale - 0.5f * W_) * per;
-    for (int e = 0; e < E_; e++) mask_kernel(l, e, FieldMask(scene, *l.field_mask, nullptr, 0.0f, e, y, x), masked.kernels[e]);
+    for (int e = 0; e < E_; e++)
+      mask_kernel(l, e, FieldMask(scene, *l.field_mask, nullptr, 0.0f, e, y, x), masked.kernels[e]);
     return masked.kernels.data();
   }
 
@@ -836,7 +868,8 @@ class Composite {
     }
   }
 
-  void composite_strip(Scratch &b, const Kernel *kernels, size_t from, int y, uint32_t within, bool partial, bool varying, int at) {
+  void composite_strip(Scratch &b, const Kernel *kernels, size_t from, int y, uint32_t within, bool partial,
+                       bool varying, int at) {
     float share[STRIP], normalizer[STRIP], gain[STRIP], left[STRIP], light[STRIP];
     for (int e = 0; e < E_; e++) {
       const Kernel &kernel = kernels[e];
@@ -851,8 +884,10 @@ class Composite {
       // colour = light / normalizer, coverage = share / normalizer
       float *const canvas = b.canvas[C_ + e] + at;
       for (int i = 0; i < STRIP; i += LANES) {
-        const vec all_normalizer = load<vec>(normalizer + i), its_share = load<vec>(share + i), missing = lacking(all_normalizer);
-        const vec known = all_normalizer + raise(missing), per_normalizer = 1.0f / known, cover = its_share * per_normalizer;
+        const vec all_normalizer = load<vec>(normalizer + i), its_share = load<vec>(share + i),
+                  missing = lacking(all_normalizer);
+        const vec known = all_normalizer + raise(missing), per_normalizer = 1.0f / known,
+                  cover = its_share * per_normalizer;
         // a layer that covers a pixel fully removes all light behind it, however bright
         const vec its_left = its_share < known ? max(1.0f - cover, vec{}) : vec{};
         store(gain + i, per_normalizer);
@@ -877,7 +912,8 @@ class Composite {
   // 3. Interpolate between them, and put the result in front of the tile's row.
   void join_finer(const Run &run, int y0, int x0, Scratch &b) {
     const int s = run.scale;
-    const int r1 = std::min((y0 + TILE) / s + 1, run.rows - 1) / PART, c1 = std::min((x0 + TILE) / s + 1, run.columns - 1) / PART;
+    const int r1 = std::min((y0 + TILE) / s + 1, run.rows - 1) / PART,
+              c1 = std::min((x0 + TILE) / s + 1, run.columns - 1) / PART;
     bool any = false;
     for (int r = y0 / s / PART; r <= r1; r++)
       for (int c = x0 / s / PART; c <= c1; c++) any |= run.used[(size_t)r * run.part_columns + c];
@@ -929,7 +965,8 @@ class Composite {
       if (!upper_covers && !lower_covers) continue;
       // widened row: the first value lies half a coarse pixel before the tile
       auto value_at = [&](int c, int x) {
-        const vec a = load<vec>(upper + (size_t)c * pitch + s / 2 + x), b = load<vec>(lower + (size_t)c * pitch + s / 2 + x);
+        const vec a = load<vec>(upper + (size_t)c * pitch + s / 2 + x),
+                  b = load<vec>(lower + (size_t)c * pitch + s / 2 + x);
         return a + down * (b - a);
       };
       for (int c = 0; c < channels; c++) {
@@ -949,7 +986,8 @@ class Composite {
   void add_stand_ins(int y0, int x0, int rows, int columns, Scratch &b) {
     around(y0 / CELL, (y0 + rows - 1) / CELL, x0 / CELL, (x0 + columns - 1) / CELL, b.layers.data());
     bool any = false;  // a pixel between a layer and the next one belongs to both
-    for (int k = 0; k < N_ && layers_[k].node < 0; k++) any |= layers_[std::min(k + 1, N_ - 1)].node > -2 * BARELY_BLURRED && has(b.layers.data(), k);
+    for (int k = 0; k < N_ && layers_[k].node < 0; k++)
+      any |= layers_[std::min(k + 1, N_ - 1)].node > -2 * BARELY_BLURRED && has(b.layers.data(), k);
     if (!any) return;
     std::vector<float> memory((size_t)s_.count * (C_ + 2) * (TILE + LANES));
     float *m = memory.data();
@@ -985,11 +1023,13 @@ class Composite {
   // Renders one tile of the picture.
   //
   // 1. List the full-resolution layers whose blur reaches the tile, and read the window that they need.
-  // 2. From far to near, composite these layers and the coarser canvases onto the tile's canvas; between the focus and the
+  // 2. From far to near, composite these layers and the coarser canvases onto the tile's canvas; between the focus and
+  // the
   //    layers before it, the surfaces that stand in for the background.
   // 3. Finish: light behind all layers, highlights.
   void tile(int tile_row, int tile_column, Scratch &b) {
-    const int y0 = tile_row * TILE, x0 = tile_column * TILE, rows = std::min(TILE, H_ - y0), columns = std::min(TILE, W_ - x0);
+    const int y0 = tile_row * TILE, x0 = tile_column * TILE, rows = std::min(TILE, H_ - y0),
+              columns = std::min(TILE, W_ - x0);
     for (float *canvas : b.canvas) memset(canvas, 0, TILE_PIXELS * sizeof(float));
     // layers of full resolution whose light reaches the tile
     std::vector<int> reaching;
@@ -998,7 +1038,9 @@ class Composite {
       const Layer &l = layers_[k];
       if (l.scale > 1) continue;
       const int reach = ceil_div(l.half, CELL);
-      if (reach != known_reach) around(y0 / CELL - reach, (y0 + TILE) / CELL - 1 + reach, x0 / CELL - reach, (x0 + TILE) / CELL - 1 + reach, b.layers.data());
+      if (reach != known_reach)
+        around(y0 / CELL - reach, (y0 + TILE) / CELL - 1 + reach, x0 / CELL - reach, (x0 + TILE) / CELL - 1 + reach,
+               b.layers.data());
       known_reach = reach;
       if (!has(b.layers.data(), k)) continue;
       reaching.push_back(k);
@@ -1022,7 +1064,8 @@ class Composite {
       for (; next < reaching.size() && reaching[next] >= run.first; next++) {
         const Layer &l = layers_[reaching[next]];
         pass(l);
-        const int first = halo - l.half, from = x0 - l.half - left, reach_rows = rows + 2 * l.half, reach_columns = columns + 2 * l.half;
+        const int first = halo - l.half, from = x0 - l.half - left, reach_rows = rows + 2 * l.half,
+                  reach_columns = columns + 2 * l.half;
         if (s_.independent)
           block_means(reaching[next], 1, top + first, left + from, reach_rows, reach_columns, first, from, b);
         else
@@ -1040,7 +1083,8 @@ class Composite {
     const bool has_rays = !job_.rays.empty() && ray_start_[which] < ray_start_[which + 1];
     if (has_rays) {
       memset(traced, 0, sizeof(float) * C * TILE_PIXELS);
-      splat(job_, visibility_, y0, x0, &ray_list_[ray_start_[which]], ray_start_[which + 1] - ray_start_[which], ray_kernels_, gains_, traced);
+      splat(job_, visibility_, y0, x0, &ray_list_[ray_start_[which]], ray_start_[which + 1] - ray_start_[which],
+            ray_kernels_, gains_, traced);
     }
     const bool normalize = over_ ? job_.behind.empty() : (bool)job_.scene.normalize;
     if (has_rays && !over_)
@@ -1090,7 +1134,8 @@ class Composite {
       for (int c = 0; c < C_; c++) {
         const float *cover = b.canvas[C_ + (E_ > 1 ? c : 0)] + y * TILE;
         float *canvas = b.canvas[c] + y * TILE;
-        const float *upper = &job_.behind[((size_t)c * h + top) * w], *lower = &job_.behind[((size_t)c * h + bottom) * w];
+        const float *upper = &job_.behind[((size_t)c * h + top) * w],
+                    *lower = &job_.behind[((size_t)c * h + bottom) * w];
         for (int x = 0; x < columns; x += LANES) {
           const vec uncovered = 1.0f - load<vec>(cover + x), old = load<vec>(canvas + x);
           const auto is_uncovered = uncovered > COVERED;
@@ -1098,10 +1143,12 @@ class Composite {
           vec above_left, above_right, below_left, below_right;
           for (int i = 0; i < LANES; i++) {
             const int left = before[x + i], right = std::min(left + 1, w - 1);
-            above_left[i] = upper[left], above_right[i] = upper[right], below_left[i] = lower[left], below_right[i] = lower[right];
+            above_left[i] = upper[left], above_right[i] = upper[right], below_left[i] = lower[left],
+            below_right[i] = lower[right];
           }
           const vec part = load<vec>(across + x);
-          const vec above = above_left + part * (above_right - above_left), below = below_left + part * (below_right - below_left);
+          const vec above = above_left + part * (above_right - above_left),
+                    below = below_left + part * (below_right - below_left);
           store(canvas + x, is_uncovered ? old + uncovered * (above + down * (below - above)) : old);
         }
       }
@@ -1161,8 +1208,6 @@ int LayerIndex::only_interval(size_t i) const {
   return last <= first + 1 ? first : -1;
 }
 
-void composite(const Job &job, const RayKernels &ray_kernels, float *out) {
-  Composite(job, ray_kernels, out).run();
-}
+void composite(const Job &job, const RayKernels &ray_kernels, float *out) { Composite(job, ray_kernels, out).run(); }
 
 }  // namespace torchdof

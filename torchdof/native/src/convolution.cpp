@@ -22,7 +22,8 @@ constexpr int SHORT = 10;  // half width up to which a single float32 sum is acc
 inline int stride_of(int half) { return 2 * half + 1 + 2 * (ROWS - 1); }
 
 template <bool SYMMETRIC, bool LONG>
-void rows_of(const float *in, int pitch, const uint32_t *rows, uint32_t columns, const Kernel &kernel, vec (&sum)[ROWS][VECTORS]) {
+void rows_of(const float *in, int pitch, const uint32_t *rows, uint32_t columns, const Kernel &kernel,
+             vec (&sum)[ROWS][VECTORS]) {
   const int half = kernel.half, stride = stride_of(half);
   for (int i = 0; i < ROWS + 2 * half; i++) {
     const int first = kernel.first[i], last = kernel.last[i];
@@ -124,7 +125,8 @@ void mask_kernel(const Layer &layer, int colour, const FieldMask &mask, Kernel &
     float *to = masked.taps.data() + column;
     float low = -half, high = half;
     if (layer.spots) mask.rows_of((float)-d, low, high);
-    const int start = (int)std::ceil(std::clamp(half - high, 0.0f, (float)side)), end = (int)std::floor(std::clamp(half - low, -1.0f, (float)(side - 1))) + 1;
+    const int start = (int)std::ceil(std::clamp(half - high, 0.0f, (float)side)),
+              end = (int)std::floor(std::clamp(half - low, -1.0f, (float)(side - 1))) + 1;
     for (int y = start; y < end; y += LANES) {
       const int n = std::min(LANES, end - y);
       vec taps = {};
@@ -147,7 +149,8 @@ void mask_kernel(const Layer &layer, int colour, const FieldMask &mask, Kernel &
   find_rows(masked);
 }
 
-void convolve_strip(const float *in, int pitch, const uint32_t *rows, uint32_t columns, const Kernel &kernel, float *out) {
+void convolve_strip(const float *in, int pitch, const uint32_t *rows, uint32_t columns, const Kernel &kernel,
+                    float *out) {
   vec sum[ROWS][VECTORS] = {};
   if (kernel.symmetric && kernel.half <= SHORT)
     rows_of<true, false>(in, pitch, rows, columns, kernel, sum);

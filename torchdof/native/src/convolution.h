@@ -11,9 +11,9 @@ namespace torchdof {
 // A blur kernel.
 struct Kernel {
   int half = 0;
-  bool symmetric = true;       // about the vertical axis
+  bool symmetric = true;  // about the vertical axis
   float sum = 0;
-  std::vector<float> taps;     // see convolution.cpp
+  std::vector<float> taps;       // see convolution.cpp
   std::vector<int> first, last;  // range of column offsets with taps for each input row; empty if first > last
 };
 
@@ -30,6 +30,7 @@ inline uint32_t marks(int first, int last) { return (mark(last) | (mark(last) - 
 inline uint32_t strip_inputs(int x, int half) { return marks(x, x + STRIP_COLUMNS - 1 + 2 * half); }
 // Convolves rows (`pitch` values apart) with a kernel: out [STRIP_ROWS, STRIP_COLUMNS]. The input begins `half` rows
 // and columns before the output. Input row i is skipped if rows[i] has none of the bits of `columns`.
-void convolve_strip(const float *in, int pitch, const uint32_t *rows, uint32_t columns, const Kernel &kernel, float *out);
+void convolve_strip(const float *in, int pitch, const uint32_t *rows, uint32_t columns, const Kernel &kernel,
+                    float *out);
 
 }  // namespace torchdof

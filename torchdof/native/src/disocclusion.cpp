@@ -24,14 +24,14 @@ constexpr float FALL = constants::disocclusion::FALL;
 constexpr float SURE = constants::disocclusion::SURE;
 constexpr float MIXED = constants::disocclusion::MIXED;
 constexpr float HIDING_FROM_PX = constants::disocclusion::HIDING_FROM_PX;
-constexpr int BAND = 8;         // rows of a level computed together
-constexpr int CELL_LEVEL = 3;   // cells that may show hidden surfaces have the size of this level's samples
+constexpr int BAND = 8;        // rows of a level computed together
+constexpr int CELL_LEVEL = 3;  // cells that may show hidden surfaces have the size of this level's samples
 
 // One level of a pyramid of the farthest surfaces. A sample has `stride` values: light of each channel, coc, weight,
 // padding.
 struct Level {
   int height, width, step, stride, channels;
-  float vote;  // weight relative to other levels; 0: weights already contain it
+  float vote;      // weight relative to other levels; 0: weights already contain it
   float least_px;  // blur above which a pixel reads this level; in full from twice this blur
   Buffer<float> values;
   float centre_y, centre_x;  // centre of the image, in its pixels; the level has the same centre
@@ -40,6 +40,11 @@ struct Level {
   float *at(int y, int x) const { return values.data() + ((size_t)y * width + x) * stride; }
   float coc(int y, int x) const { return at(y, x)[channels]; }
 };
+
+// While hidden surfaces are filled, the sign of a second surface's weight tells its kind: minus for a hidden surface,
+// plus for one that matting found.
+inline vec as_hidden(vec weight) { return -weight; }
+inline bool is_hidden(float weight) { return weight < 0; }
 
 typedef float f8 __attribute__((vector_size(32)));
 constexpr int F8 = 8;
@@ -65,8 +70,8 @@ inline Place place_in(float at, int size) {
 
 // A level's sample behind a pixel.
 struct Sample {
-  float level_weight;       // of the level, for the pixel's blur, 0 to 1
-  float weight;             // of the samples that lie behind the pixel; 0 without them
+  float level_weight;      // of the level, for the pixel's blur, 0 to 1
+  float weight;            // of the samples that lie behind the pixel; 0 without them
   std::vector<f8> values;  // only valid with a weight
 
   // Reads the bilinear mean of the four samples around a position, without those in front of or at coc `here`.
@@ -80,14 +85,16 @@ struct Sample {
     const float *corners[4];
     float total = 0, counts[4];
     for (int k = 0; k < 4; k++) {
-      corners[k] = level.at(std::min(row.before + k / 2, level.height - 1), std::min(column.before + k % 2, level.width - 1));
+      corners[k] =
+          level.at(std::min(row.before + k / 2, level.height - 1), std::min(column.before + k % 2, level.width - 1));
       total += counts[k] = share[k] * corners[k][C + 1] * is_another_surface(corners[k][C] - end);
     }
     if (!(total > LEAST_SEEN)) return;
     weight = total;
     std::fill(values.begin(), values.end(), f8{});
     for (int k = 0; k < 4; k++)
-      for (size_t i = 0; i < values.size(); i++) values[i] += load<f8>(corners[k] + F8 * i) * (counts[k] * (1.0f / total));
+      for (size_t i = 0; i < values.size(); i++)
+        values[i] += load<f8>(corners[k] + F8 * i) * (counts[k] * (1.0f / total));
   }
 };
 
@@ -128,7 +135,8 @@ class Filling {
   // 3. Combine the levels behind cells of BEHIND_STEP pixels: the light behind all surfaces.
   // 4. Give each pixel of the cells found a second surface: the combined samples behind it.
   void run() {
-    const int levels = job_.levels, step = 2 << levels;  // padding of half a cell on each side; even sizes on every level
+    const int levels = job_.levels,
+              step = 2 << levels;  // padding of half a cell on each side; even sizes on every level
     area_height_ = ceil_div(job_.height + BEHIND_STEP, step) * step;
     area_width_ = ceil_div(job_.width + BEHIND_STEP, step) * step;
     coarsest_ = std::min(levels, CELL_LEVEL);
@@ -151,17 +159,19 @@ class Filling {
     found_.resize(cell_rows_ * cell_columns_);
     fine_.resize(found_.size());
     job_.parallel(ceil_div(pyramid_[0].height, BLOCK / 2), [&](int band, int) { finest(band); });
-    for (int i = 1; i < levels; i++) job_.parallel(ceil_div(pyramid_[i].height, BAND), [&](int band, int) { coarser(i, band); });
+    for (int i = 1; i < levels; i++)
+      job_.parallel(ceil_div(pyramid_[i].height, BAND), [&](int band, int) { coarser(i, band); });
     job_.parallel(cell_rows_, [&](int row, int) { find_cells(row); });
     fill();
-    // Until here hidden surfaces have negative weights, which distinguishes them from the second surfaces of mixed
-    // pixels. Small weights of the latter fall to 0, so that a hidden surface can take their place without a step.
+    // Small weights of mixed pixels' second surfaces fall to 0, so that a hidden surface can take their place without a
+    // step.
     job_.parallel((int)s_.blocks.size(), [&](int i, int) {
       if (!s_.has_block(i)) return;
       const Block b = s_.block(i);
       for (int at = 0; at < BLOCK_PIXELS; at++) {
-        const float mixed = b.weight[at], counted = std::max(mixed, 0.0f) * clamp01(mixed * (2.0f / HIDDEN_WEIGHT) - 1.0f);
-        b.weight[at] = mixed < 0 ? -mixed : counted;
+        const float mixed = b.weight[at],
+                    counted = std::max(mixed, 0.0f) * clamp01(mixed * (2.0f / HIDDEN_WEIGHT) - 1.0f);
+        b.weight[at] = is_hidden(mixed) ? -mixed : counted;
         b.own_weight[at] = b.own_weight[at] > 0 ? 1.0f - counted : 0.0f;
       }
     });
@@ -181,7 +191,8 @@ class Filling {
     const int H = job_.height, W = job_.width, planes = C_ + 2;
     const Level &level = pyramid_[0];
     const int top = first_pixel(H, level.height, 2), left = first_pixel(W, level.width, 2);
-    const int across = 2 * ceil_div(level.width, LANES) * LANES + BLOCK;  // whole vectors are read, whole blocks written
+    const int across =
+        2 * ceil_div(level.width, LANES) * LANES + BLOCK;  // whole vectors are read, whole blocks written
     const size_t line = (size_t)planes * across;
     // planes of the band's rows, extended to both sides and starting at pixel `left`: first copied from the image, then
     // replaced where there are blocks
@@ -191,7 +202,8 @@ class Filling {
     auto row_of = [&](int y) { return memory.data() + (std::clamp(y, 0, H - 1) - y0) * line; };
     for (int y = y0; y <= y1; y++) {
       float *const row = row_of(y) - left;
-      for (int c = 0; c < C_; c++) memcpy(row + c * across, s_.light + c * s_.area() + (size_t)y * W, W * sizeof(float));
+      for (int c = 0; c < C_; c++)
+        memcpy(row + c * across, s_.light + c * s_.area() + (size_t)y * W, W * sizeof(float));
       memcpy(row + C_ * across, s_.coc + (size_t)y * W, W * sizeof(float));
       std::fill(row + (C_ + 1) * across, row + (C_ + 1) * across + W, 1.0f);
     }
@@ -224,12 +236,14 @@ class Filling {
       const Block b = s_.block(which);
       float *coc = out + C * pitch, *weight = coc + pitch;
       for (int x = 0; x < BLOCK; x += LANES) {
-        const vec its = load<vec>(b.coc + first + x), mine = load<vec>(coc + x), share = load<vec>(b.weight + first + x);
+        const vec its = load<vec>(b.coc + first + x), mine = load<vec>(coc + x),
+                  share = load<vec>(b.weight + first + x);
         const auto mixed = (share > MIXED) & (its > mine);
         store(coc + x, mixed ? its : mine);
         store(weight + x, mixed ? share : load<vec>(b.own_weight + first + x));
         for (int c = 0; c < C; c++)
-          store(out + c * pitch + x, mixed ? load<vec>(b.other + c * BLOCK_PIXELS + first + x) : load<vec>(b.own + c * BLOCK_PIXELS + first + x));
+          store(out + c * pitch + x, mixed ? load<vec>(b.other + c * BLOCK_PIXELS + first + x)
+                                           : load<vec>(b.own + c * BLOCK_PIXELS + first + x));
       }
       for (int x = 0; s_.valid && x < n; x++)
         if (!(s_.valid[(size_t)y * job_.width + x0 + x] > 0)) coc[x] = -NEVER;
@@ -299,10 +313,13 @@ class Filling {
           child[k] = fine.at(2 * y + k / 2, 2 * x + k % 2);
           farthest = std::max(farthest, child[k][C_]);
         }
-        for (int k = 0; k < 4; k++) total += counts[k] = child[k][C_ + 1] * (1.0f - is_another_surface(farthest - child[k][C_]));
+        for (int k = 0; k < 4; k++)
+          total += counts[k] = child[k][C_ + 1] * (1.0f - is_another_surface(farthest - child[k][C_]));
         total *= 0.25f;
         for (float &count : counts) count *= 0.25f / std::max(total, LEAST_TOTAL);
-        for (int c = 0; c <= C_; c++) out[c] = child[0][c] * counts[0] + child[1][c] * counts[1] + child[2][c] * counts[2] + child[3][c] * counts[3];
+        for (int c = 0; c <= C_; c++)
+          out[c] =
+              child[0][c] * counts[0] + child[1][c] * counts[1] + child[2][c] * counts[2] + child[3][c] * counts[3];
         if (!(total > 0)) out[C_] = -NEVER;
         out[C_ + 1] = total;
         std::fill(out + C_ + 2, out + stride_, 0.0f);
@@ -339,22 +356,24 @@ class Filling {
   }
 
   // Positions of pixels first, first + step, ... in a level.
-  static std::vector<Place> places(float first, int step, int count, int size, float (Level::*place)(float) const, const Level &level) {
+  static std::vector<Place> places(float first, int step, int count, int size, float (Level::*place)(float) const,
+                                   const Level &level) {
     std::vector<Place> at(count);
     for (int i = 0; i < count; i++) at[i] = place_in((level.*place)(first + (float)i * step), size);
     return at;
   }
 
-  // Steps 3 and 4 of `run`. The levels from FINE_LEVELS up are combined once for each cell of BEHIND_STEP pixels, and read like
-  // one level by the pixels.
+  // Steps 3 and 4 of `run`. The levels from FINE_LEVELS up are combined once for each cell of BEHIND_STEP pixels, and
+  // read like one level by the pixels.
   void fill() {
     const int levels = job_.levels, H = job_.height, W = job_.width, C = C_;
-    const int rows = area_height_ / BEHIND_STEP, columns = area_width_ / BEHIND_STEP, coarse = std::max(levels - FINE_LEVELS, 0);
+    const int rows = area_height_ / BEHIND_STEP, columns = area_width_ / BEHIND_STEP,
+              coarse = std::max(levels - FINE_LEVELS, 0);
     const int first_y = first_pixel(H, rows, BEHIND_STEP), first_x = first_pixel(W, columns, BEHIND_STEP);
     job_.behind_height = rows;
     job_.behind_width = columns;
     job_.behind.resize((size_t)C * rows * columns + 8);  // padding: eight values are read from any position
-    Level combined;  // mean of the coarse levels behind cells of BEHIND_STEP pixels
+    Level combined;                                      // mean of the coarse levels behind cells of BEHIND_STEP pixels
     combined.height = rows;
     combined.width = columns;
     combined.step = BEHIND_STEP;
@@ -368,8 +387,10 @@ class Filling {
     }
     std::vector<std::vector<Place>> ys, xs;  // positions of the cells in each level
     for (const Level &l : pyramid_) {
-      ys.push_back(places(0.5f * (H - 1) - 0.5f * (rows - 1) * BEHIND_STEP, BEHIND_STEP, rows, l.height, &Level::place_y, l));
-      xs.push_back(places(0.5f * (W - 1) - 0.5f * (columns - 1) * BEHIND_STEP, BEHIND_STEP, columns, l.width, &Level::place_x, l));
+      ys.push_back(
+          places(0.5f * (H - 1) - 0.5f * (rows - 1) * BEHIND_STEP, BEHIND_STEP, rows, l.height, &Level::place_y, l));
+      xs.push_back(places(0.5f * (W - 1) - 0.5f * (columns - 1) * BEHIND_STEP, BEHIND_STEP, columns, l.width,
+                          &Level::place_x, l));
     }
     const Level &base = pyramid_[std::min(levels, FINE_LEVELS) - 1];
     std::vector<float> mean(C, 0.0f);  // mean light, for cells without valid pixels
@@ -409,7 +430,8 @@ class Filling {
             }
           if (needed) {
             for (int i = 0; i < levels; i++) samples[i].read(pyramid_[i], ys[i][row], xs[i][column], near);
-            if (coarse) coarse_mean[C + 1] = mix(&pyramid_[FINE_LEVELS], &samples[FINE_LEVELS], coarse, false, coarse_mean);
+            if (coarse)
+              coarse_mean[C + 1] = mix(&pyramid_[FINE_LEVELS], &samples[FINE_LEVELS], coarse, false, coarse_mean);
             if (mix(pyramid_.data(), samples.data(), levels, true, mean_behind.data()) > 0) light = mean_behind.data();
           }
         }
@@ -446,8 +468,8 @@ class Filling {
     const std::vector<Place> *ys, *xs;
     int first = 0;
     // for each level and row around the cell: samples before and after each of the cell's columns
-    std::vector<vec> samples;
-    std::vector<float> lines;  // the same in the level's order
+    std::vector<vec> samples = {};
+    std::vector<float> lines = {};  // the same in the level's order
   };
 
   // Fills the second surfaces of a cell: `behind` and `mix` for LANES pixels at once.
@@ -458,7 +480,8 @@ class Filling {
   template <int CHANNELS>
   void fill_cell(int y0, int x0, CellLevels &to) {
     constexpr int VECTORS = CELL / LANES, ROWS = CELL / 2 + 2;
-    const int C = CHANNELS ? CHANNELS : C_, planes = C + 2, W = job_.width, which = y0 / BLOCK * s_.block_columns + x0 / BLOCK;
+    const int C = CHANNELS ? CHANNELS : C_, planes = C + 2, W = job_.width,
+              which = y0 / BLOCK * s_.block_columns + x0 / BLOCK;
     const int rows = std::min(CELL, job_.height - y0), columns = std::min(CELL, W - x0);
     const size_t beside = (size_t)planes * VECTORS, below = 2 * beside, of_level = ROWS * below;
     to.samples.resize(to.count * of_level + planes);
@@ -495,7 +518,8 @@ class Filling {
       for (int v = 0; v < VECTORS; v++) {
         const vec here = load<vec>(here_of + v * LANES), size = max(here, -here);
         ivec wanted = size > HIDING_FROM_PX;
-        if (s_.has_block(which)) wanted &= load<vec>(s_.block(which).weight + within + v * LANES) < broadcast(0.5f * HIDDEN_WEIGHT);
+        if (s_.has_block(which))
+          wanted &= load<vec>(s_.block(which).weight + within + v * LANES) < broadcast(0.5f * HIDDEN_WEIGHT);
         if (!any_of(wanted)) continue;
         const vec end = end_of_surface(here);
         vec total = {};
@@ -510,7 +534,8 @@ class Filling {
           corners[3] = corners[2] + beside;
           vec right, weight = {}, counts[4];
           for (int x = 0; x < LANES; x++) right[x] = xs[std::min(v * LANES + x, columns - 1)].part;
-          const vec left = 1.0f - right, shares[4] = {left * (1.0f - row.part), right * (1.0f - row.part), left * row.part, right * row.part};
+          const vec left = 1.0f - right, shares[4] = {left * (1.0f - row.part), right * (1.0f - row.part),
+                                                      left * row.part, right * row.part};
           for (int k = 0; k < 4; k++) {
             const vec farther = is_another_surface(corners[k][C * VECTORS] - end);
             weight += counts[k] = shares[k] * corners[k][(C + 1) * VECTORS] * farther;
@@ -525,7 +550,8 @@ class Filling {
           for (vec &count : counts) count *= each;
           for (int k = 0; k <= C; k++) {
             const size_t plane = (size_t)k * VECTORS;
-            const vec sample = corners[0][plane] * counts[0] + corners[1][plane] * counts[1] + corners[2][plane] * counts[2] + corners[3][plane] * counts[3];
+            const vec sample = corners[0][plane] * counts[0] + corners[1][plane] * counts[1] +
+                               corners[2][plane] * counts[2] + corners[3][plane] * counts[3];
             mean[k] += (sample - mean[k]) * part;
           }
         }
@@ -534,12 +560,14 @@ class Filling {
         // replaces a second surface to which matting gave a small weight
         const Block b = s_.make_block(which);
         const size_t at = within + v * LANES;
-        const vec mixed = load<vec>(b.weight + at), hidden = min(total * (1.0f / CERTAIN), broadcast(1.0f)) * (2.0f * mixed - HIDDEN_WEIGHT);
+        const vec mixed = load<vec>(b.weight + at), certain = min(total * (1.0f / CERTAIN), broadcast(1.0f));
+        const vec hidden = as_hidden(certain * (HIDDEN_WEIGHT - 2.0f * mixed));
         auto replace = [&](float *other, vec hidden_one) { store(other, wanted ? hidden_one : load<vec>(other)); };
         for (int c = 0; c < C; c++) replace(b.other + c * BLOCK_PIXELS + at, mean[c]);
         replace(b.coc + at, mean[C]);
         vec valid = broadcast(1.0f);
-        for (int x = 0; s_.valid && x < std::min(LANES, columns - v * LANES); x++) valid[x] = s_.valid[(size_t)(y0 + y) * W + x0 + v * LANES + x];
+        for (int x = 0; s_.valid && x < std::min(LANES, columns - v * LANES); x++)
+          valid[x] = s_.valid[(size_t)(y0 + y) * W + x0 + v * LANES + x];
         store(b.weight + at, wanted ? hidden * valid : mixed);
       }
     }

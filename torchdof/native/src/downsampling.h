@@ -13,11 +13,11 @@ namespace torchdof {
 
 // The node before each pixel of each surface, and the layers that occur in each cell.
 struct LayerIndex {
-  float low, high;            // first and last node
-  int words, rows, columns;   // words of `bits` for each cell; number of cells
-  std::vector<uint64_t> bits;    // layers that occur in each cell, one bit for each
-  std::vector<uint8_t> single;   // cells in which every pixel shows only the first surface
-  std::vector<uint8_t> mixed;    // cells with mixed pixels whose farther surface continues behind the nearer one
+  float low, high;              // first and last node
+  int words, rows, columns;     // words of `bits` for each cell; number of cells
+  std::vector<uint64_t> bits;   // layers that occur in each cell, one bit for each
+  std::vector<uint8_t> single;  // cells in which every pixel shows only the first surface
+  std::vector<uint8_t> mixed;   // cells with mixed pixels whose farther surface continues behind the nearer one
   std::vector<Buffer<uint16_t>> intervals;
 
   const uint64_t *cell(size_t i) const { return &bits[i * words]; }
@@ -25,7 +25,9 @@ struct LayerIndex {
   int only_interval(size_t i) const;
   // Position on the blur axis.
   template <typename V>
-  V place(V coc) const { return axis(coc, low, high); }
+  V place(V coc) const {
+    return axis(coc, low, high);
+  }
 };
 
 // Sparse block means: contributions of a block's pixels between two nodes, sorted by row of blocks. Row r has pieces
@@ -47,8 +49,8 @@ class Downsampled {
   int scale, margin, rows, columns, channels, pitch, first_band;  // margin: blocks around the frame
   // for each band of BLOCK rows of pixels: contributions beyond the first of a block, which is in the planes
   std::vector<Pieces> pieces;
-  // For each interval between nodes: whether a layer of this scale blurs it, whether it lies behind one of them, and the
-  // interval that represents it.
+  // For each interval between nodes: whether a layer of this scale blurs it, whether it lies behind one of them, and
+  // the interval that represents it.
   std::vector<uint8_t> wanted, behind;
   std::vector<uint16_t> stands_for;
   std::vector<uint8_t> near;  // blocks of BLOCK x BLOCK pixels that layers of this scale may reach

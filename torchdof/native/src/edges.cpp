@@ -2,6 +2,8 @@
 //
 // The frame is processed in tiles of AREA x AREA pixels, and within a tile only where the map changes. Each tile is
 // copied with a margin, padded beyond the frame with the nearest border pixel, so that loops run in whole vectors.
+#include "constants/edges.h"
+
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -11,7 +13,6 @@
 #include <vector>
 
 #include "api.h"
-#include "constants/edges.h"
 #include "entry.h"
 #include "memory.h"
 #include "simd.h"
@@ -82,21 +83,23 @@ constexpr float LARGEST = constants::edges::LARGEST;
 constexpr float BRIGHTEST = constants::edges::BRIGHTEST;
 constexpr int KINDS = DIRECTIONS * PLACES;
 
-constexpr int AREA = 96;       // side of a tile in pixels
+constexpr int AREA = 96;  // side of a tile in pixels
 // A pixel's result depends on the pixels within this many of it: without ramps, and with ramps.
 constexpr int STEP_HALO = RINGS + REACH, HALO = RINGS + RAMP_REACH + FLAT_REACH + 3;
 constexpr float NO_SCORE = 100.0f;  // marks pixels without a score; above all scores
 constexpr int NEIGHBOURS[8][2] = {{-1, -1}, {-1, 0}, {-1, 1}, {0, -1}, {0, 1}, {1, -1}, {1, 0}, {1, 1}};
 constexpr float FINITE = 3.402823466e38f;
 // Vectors of a window of SIDE x SIDE pixels: first WHOLE columns of each row, then the remaining 4 columns.
-constexpr int SIDE = 2 * REACH + 1, WHOLE = SIDE / LANES * LANES, ROWS_AT_ONCE = LANES / 4, WINDOW = SIDE * WHOLE / LANES + (SIDE + ROWS_AT_ONCE - 1) / ROWS_AT_ONCE;
+constexpr int SIDE = 2 * REACH + 1, WHOLE = SIDE / LANES * LANES, ROWS_AT_ONCE = LANES / 4,
+              WINDOW = SIDE * WHOLE / LANES + (SIDE + ROWS_AT_ONCE - 1) / ROWS_AT_ONCE;
 static_assert(SIDE - WHOLE <= 4 && WHOLE > REACH + 1);
 
 // Bits of a pixel's mark. NEAR: the map gives it the near surface's depth. Bits from UNSURE up: index into SURE.
 constexpr uint8_t EDGE = 1, RAMP = 2, NEAR = 4, LISTED = 8, UNSURE = 32;
 // weight as a colour reference: far from steps, RINGS pixels from one, ..., beside one; 0 for invalid pixels and ramps
 using constants::edges::SURE;
-constexpr float SURE_OF[256 / UNSURE] = {(float)SURE[4], (float)SURE[3], (float)SURE[2], (float)SURE[1], (float)SURE[0]};
+constexpr float SURE_OF[256 / UNSURE] = {(float)SURE[4], (float)SURE[3], (float)SURE[2], (float)SURE[1],
+                                         (float)SURE[0]};
 
 // A rectangle in the coordinates of the frame; may reach beyond the frame.
 struct Part {
@@ -119,7 +122,8 @@ struct Edge {
 class Grid : public Part {
  public:
   explicit Grid(const Part &part, int planes = 1)
-      : Part(part), pitch((part.width + LANES - 1) / LANES * LANES + 2 * LANES), size((size_t)part.height * pitch), data_(size * planes + LANES) {
+      : Part(part), pitch((part.width + LANES - 1) / LANES * LANES + 2 * LANES), size((size_t)part.height * pitch),
+        data_(size * planes + LANES) {
     std::fill(&data_[size * planes], &data_[size * planes] + LANES, 0.0f);
   }
 
@@ -139,7 +143,8 @@ template <typename Look>
 inline void each_of_window(const Look &look) {
   int n = 0;
   for (int v = 0; v < SIDE; v++)
-    for (int u = 0; u < WHOLE; u += LANES) look(n++, [v, u](const float *p, int pitch) { return load<vec>(p + v * pitch + u); });
+    for (int u = 0; u < WHOLE; u += LANES)
+      look(n++, [v, u](const float *p, int pitch) { return load<vec>(p + v * pitch + u); });
   for (int v = 0; v + ROWS_AT_ONCE <= SIDE; v += ROWS_AT_ONCE)
     look(n++, [v](const float *p, int pitch) {
       p += v * pitch + WHOLE;
@@ -158,7 +163,8 @@ std::vector<float> window(const Of &of) {
   std::vector<float> values(WINDOW * LANES, 0.0f);
   for (int v = 0; v < SIDE; v++)
     for (int u = 0; u < SIDE; u++)
-      values[u < WHOLE ? v * WHOLE + u : SIDE * WHOLE + 4 * v + u - WHOLE] = of((float)((v - REACH) * (v - REACH) + (u - REACH) * (u - REACH)));
+      values[u < WHOLE ? v * WHOLE + u : SIDE * WHOLE + 4 * v + u - WHOLE] =
+          of((float)((v - REACH) * (v - REACH) + (u - REACH) * (u - REACH)));
   return values;
 }
 
@@ -182,17 +188,21 @@ void max_filter(const Grid &in, const Grid &out, const Grid &rows, const Part &p
     return max(load<vec>(from), max(load<vec>(from + MIDDLE * stride), load<vec>(from + LAST * stride)));
   };
   for (int y = part.y0 - REACH_; y < part.bottom() + REACH_; y++) {
-    for (int x = part.x0; RUN > 1 && x < part.right() + LAST; x += LANES) store(rows.at(y, x), run(in.at(y, x - REACH_), 1));
-    for (int x = part.x0; x < part.right(); x += LANES) store(rows.at(y, x), three(RUN > 1 ? rows.at(y, x) : in.at(y, x - REACH_), 1));
+    for (int x = part.x0; RUN > 1 && x < part.right() + LAST; x += LANES)
+      store(rows.at(y, x), run(in.at(y, x - REACH_), 1));
+    for (int x = part.x0; x < part.right(); x += LANES)
+      store(rows.at(y, x), three(RUN > 1 ? rows.at(y, x) : in.at(y, x - REACH_), 1));
   }
-  each_vector({part.y0 - REACH_, part.x0, RUN > 1 ? part.height + LAST : 0, part.width}, [&](int y, int x) { store(rows.at(y, x), run(rows.at(y, x), rows.pitch)); });
+  each_vector({part.y0 - REACH_, part.x0, RUN > 1 ? part.height + LAST : 0, part.width},
+              [&](int y, int x) { store(rows.at(y, x), run(rows.at(y, x), rows.pitch)); });
   each_vector(part, [&](int y, int x) { store(out.at(y, x), three(rows.at(y - REACH_, x), rows.pitch)); });
 }
 
 // Maximum over 3 x 3 values around each value of a vector.
 inline vec max_3x3(const float *from, int pitch) {
   vec high = max(load<vec>(from), max(load<vec>(from - 1), load<vec>(from + 1)));
-  for (const float *row : {from - pitch, from + pitch}) high = max(high, max(load<vec>(row), max(load<vec>(row - 1), load<vec>(row + 1))));
+  for (const float *row : {from - pitch, from + pitch})
+    high = max(high, max(load<vec>(row), max(load<vec>(row - 1), load<vec>(row + 1))));
   return high;
 }
 
@@ -204,7 +214,8 @@ void sums(const Grid &in, const Grid &out, const Grid &rows, const Part &part, f
     for (int d = 1; d <= REACH_; d++) total += load<vec>(middle - d * stride) + load<vec>(middle + d * stride);
     return total;
   };
-  each_vector({part.y0 - REACH_, part.x0, part.height + 2 * REACH_, part.width}, [&](int y, int x) { store(rows.at(y, x), sum(in.at(y, x), 1)); });
+  each_vector({part.y0 - REACH_, part.x0, part.height + 2 * REACH_, part.width},
+              [&](int y, int x) { store(rows.at(y, x), sum(in.at(y, x), 1)); });
   each_vector(part, [&](int y, int x) { store(out.at(y, x), sum(rows.at(y, x), rows.pitch) * factor); });
 }
 
@@ -221,10 +232,10 @@ struct Around {
 // Edge pixels of a part, in row order.
 struct Group {
   Part part;
-  std::vector<Edge> edges;
-  Part bounds = {};               // bounding box of the edges
-  std::vector<Judgement> judged;  // one for each edge
-  std::vector<Around> around;     // one for every LANES edges
+  std::vector<Edge> edges = {};
+  Part bounds = {};                    // bounding box of the edges
+  std::vector<Judgement> judged = {};  // one for each edge
+  std::vector<Around> around = {};     // one for every LANES edges
 };
 
 // Selects edge pixels by kind: first those to which the map gives the far surface, then those with the near one.
@@ -241,7 +252,8 @@ struct EdgeSums {
 class Repair {
  public:
   explicit Repair(const torchdof_map &map)
-      : map_(map), sign_(map.of_coc ? -1.0f : 1.0f), height_(map.height), width_(map.width), channels_(map.channels), area_((size_t)map.height * map.width), score_(area_), evidence_(area_), marks_(area_) {}
+      : map_(map), sign_(map.is_coc ? -1.0f : 1.0f), height_(map.height), width_(map.width), channels_(map.channels),
+        area_((size_t)map.height * map.width), score_(area_), evidence_(area_), marks_(area_) {}
 
   // 1. Find the edges of a sample of the frame, see whether the map is soft, and decide by colour which surface each
   //    pixel shows.
@@ -252,7 +264,8 @@ class Repair {
   bool run() {
     noise_step_ = NOISES * noise();
     const int every = (int)std::ceil(std::sqrt((double)area_ / SAMPLED));
-    const bool finds_twice = map_.automatic && every > 4;  // the sample is a small part of the frame: find only its edges first
+    const bool finds_twice =
+        map_.automatic && every > 4;  // the sample is a small part of the frame: find only its edges first
     const auto is_sampled = [&](int y, int x) { return (block_of(y, height_) + block_of(x, width_)) % every == 0; };
     std::vector<Group> groups, sampled;
     KindMask all_kinds;
@@ -297,9 +310,13 @@ class Repair {
   // Kind of an edge pixel, plus KINDS if the map gives it the near surface: an index into a KindMask.
   int given_kind_of(const Edge &edge) const { return edge.kind + (marks_[edge.i] & NEAR ? KINDS : 0); }
   // Share of the pixels of a given kind to which the map gives the wrong surface.
-  float wrong(int given_kind) const { return given_kind >= KINDS ? 1.0f - shares_[given_kind - KINDS] : shares_[given_kind]; }
+  float wrong(int given_kind) const {
+    return given_kind >= KINDS ? 1.0f - shares_[given_kind - KINDS] : shares_[given_kind];
+  }
   static float valid(float v) { return std::fabs(v) <= LARGEST ? v : 0.0f; }
-  static float root(float light) { return (light <= FINITE) & (light > 0) ? std::sqrt(std::min(light, BRIGHTEST)) : 0.0f; }
+  static float root(float light) {
+    return (light <= FINITE) & (light > 0) ? std::sqrt(std::min(light, BRIGHTEST)) : 0.0f;
+  }
 
   // Standard deviation of the map's noise, from the median second difference along rows or columns, whichever is
   // larger. At least the noise of rounding, if the map has more than LEVELS_OF_A_FILE levels; their distance is the
@@ -346,7 +363,8 @@ class Repair {
     for (const Group &group : sampled)
       each_edge(group, [&](size_t, const Edge &edge, int y, int x) {
         const float *value = map_.nearness + edge.i;
-        length += climb(value, x > 0 ? -1 : 0, x < width_ - 1 ? 1 : 0, y > 0 ? -width_ : 0, y < height_ - 1 ? width_ : 0, std::max(edge.near - edge.far, 1e-12f));
+        length += climb(value, x > 0 ? -1 : 0, x < width_ - 1 ? 1 : 0, y > 0 ? -width_ : 0,
+                        y < height_ - 1 ? width_ : 0, std::max(edge.near - edge.far, 1e-12f));
       });
     return ramps > WIDE * length || mixed > MIXED * ramps;
   }
@@ -382,7 +400,8 @@ class Repair {
   std::vector<Group> tiles() const {
     std::vector<Group> parts;
     for (int y = 0; y < height_; y += AREA)
-      for (int x = 0; x < width_; x += AREA) parts.push_back({{y, x, std::min(AREA, height_ - y), std::min(AREA, width_ - x)}, {}});
+      for (int x = 0; x < width_; x += AREA)
+        parts.push_back({{y, x, std::min(AREA, height_ - y), std::min(AREA, width_ - x)}});
     return parts;
   }
 
@@ -407,14 +426,15 @@ class Repair {
     std::vector<Group> parts;
     for (const Run &y : along(height_))
       for (const Run &x : along(width_))
-        if (wanted(y.start, x.start)) parts.push_back({{y.start, x.start, y.size, x.size}, {}});
+        if (wanted(y.start, x.start)) parts.push_back({{y.start, x.start, y.size, x.size}});
     return parts;
   }
 
   // The kinds of pixels to decide in automatic mode: steps of kinds that are often wrong, and ramps if the map is soft.
   KindMask doubtful_kinds(bool is_soft) const {
     KindMask selected;
-    for (int kind = 0; kind < 2 * KINDS; kind++) selected[kind] = kind % KINDS / DIRECTIONS >= 2 * RINGS ? is_soft : wrong(kind) > DOUBTFUL;
+    for (int kind = 0; kind < 2 * KINDS; kind++)
+      selected[kind] = kind % KINDS / DIRECTIONS >= 2 * RINGS ? is_soft : wrong(kind) > DOUBTFUL;
     return selected;
   }
 
@@ -491,11 +511,13 @@ class Repair {
   }
 
   // Finds steps and ramps and their two surfaces: returns the groups' edges, and marks pixels up to `halo` around them.
-  std::vector<Group> find_in(std::vector<Group> groups, int halo, bool expects_ramps, bool measures, const KindMask &selected) {
+  std::vector<Group> find_in(std::vector<Group> groups, int halo, bool expects_ramps, bool measures,
+                             const KindMask &selected) {
     std::vector<EdgeSums> found(groups.size());
     parallel((int)groups.size(), [&](int g) {
       Group &group = groups[g];
-      find_in(group.part, in_frame(group.part.grown(halo)), expects_ramps, selected, measures ? &found[g] : nullptr, group.edges);
+      find_in(group.part, in_frame(group.part.grown(halo)), expects_ramps, selected, measures ? &found[g] : nullptr,
+              group.edges);
       group.bounds = bounds(group);
     });
     found_ = {};
@@ -509,7 +531,8 @@ class Repair {
   }
 
   // Finds the edges of one part.
-  void find_in(const Part &own, const Part &part, bool expects_ramps, const KindMask &selected, EdgeSums *found, std::vector<Edge> &edges) {
+  void find_in(const Part &own, const Part &part, bool expects_ramps, const KindMask &selected, EdgeSums *found,
+               std::vector<Edge> &edges) {
     for (int y = part.y0; y < part.bottom(); y++) {
       const size_t i = (size_t)y * width_ + part.x0;
       const float *values = map_.nearness + i;
@@ -518,7 +541,8 @@ class Repair {
     }
     const Part busy = changing(part);
     if (busy.height <= 0 || busy.width <= 0) return;
-    if (expects_ramps || !find_in(own, busy, STEP_HALO, selected, found, edges)) find_in(own, busy, HALO, selected, found, edges);
+    if (expects_ramps || !find_in(own, busy, STEP_HALO, selected, found, edges))
+      find_in(own, busy, HALO, selected, found, edges);
   }
 
   // Bounding box of the pixels where the map changes enough for an edge, grown by the halo.
@@ -528,7 +552,8 @@ class Repair {
     if (map_.steps) {
       least_step = NONE;
       for (int y = around.y0; y < around.bottom(); y++)
-        for (int x = around.x0; x < around.right(); x++) least_step = std::min(least_step, step((size_t)y * width_ + x));
+        for (int x = around.x0; x < around.right(); x++)
+          least_step = std::min(least_step, step((size_t)y * width_ + x));
     }
     const float change = 0.09f * least_step;
     Grid changes({0, 0, 2, around.width});
@@ -570,10 +595,13 @@ class Repair {
   // 2. Near and far surface within 1, 2 and 3 pixels, by maximum filters.
   // 3. A pixel belongs to the step at the smallest distance whose jump is abrupt.
   // 4. Each edge pixel gets its kind: ring or level on the ramp, side, and direction of the near surface.
-  bool find_in(const Part &own, const Part &inner, int halo, const KindMask &selected, EdgeSums *found, std::vector<Edge> &edges) {
+  bool find_in(const Part &own, const Part &inner, int halo, const KindMask &selected, EdgeSums *found,
+               std::vector<Edge> &edges) {
     const bool is_wide = halo == HALO;
-    const Part whole = inner.grown(halo), beside = inner.grown(RINGS), ramps = inner.grown(is_wide ? RINGS + RAMP_REACH : RINGS);
-    const Grid raw(whole), up(whole), down(whole), slope(whole), jump(whole), high(whole), low(whole), rows(whole), ramp(whole);
+    const Part whole = inner.grown(halo), beside = inner.grown(RINGS),
+               ramps = inner.grown(is_wide ? RINGS + RAMP_REACH : RINGS);
+    const Grid raw(whole), up(whole), down(whole), slope(whole), jump(whole), high(whole), low(whole), rows(whole),
+        ramp(whole);
     fetch(map_.nearness, raw, [this](float v) { return std::fabs(v) <= LARGEST ? sign_ * v : NAN; });
     each_vector(whole, [&](int y, int x) {
       const vec v = load<vec>(raw.at(y, x));
@@ -603,7 +631,8 @@ class Repair {
       max_filter<REACH>(down, low, rows, ramps);
       each_vector(ramps, [&](int y, int x) {
         const vec span = load<vec>(high.at(y, x)) + load<vec>(low.at(y, x));
-        const auto is_candidate = is_steep(y, x) & (load<vec>(slope.at(y, x)) > SHALLOW * span) & (span > step_at(y, x)) & (abs(load<vec>(raw.at(y, x))) <= LARGEST);
+        const auto is_candidate = is_steep(y, x) & (load<vec>(slope.at(y, x)) > SHALLOW * span) &
+                                  (span > step_at(y, x)) & (abs(load<vec>(raw.at(y, x))) <= LARGEST);
         store(ramp.at(y, x), is_candidate ? broadcast(1.0f) : vec{});
       });
     }
@@ -619,7 +648,8 @@ class Repair {
       });
     }
     // near and far surface within r + 1 pixels
-    const Grid nears[RINGS] = {Grid(beside), Grid(beside), Grid(beside)}, fars[RINGS] = {Grid(beside), Grid(beside), Grid(beside)},
+    const Grid nears[RINGS] = {Grid(beside), Grid(beside), Grid(beside)},
+               fars[RINGS] = {Grid(beside), Grid(beside), Grid(beside)},
                jumps[RINGS] = {Grid(beside), Grid(beside), Grid(beside)};
     for (int r = 0; r < RINGS; r++) {
       const Part part = inner.grown(RINGS - 1 - r);
@@ -639,7 +669,8 @@ class Repair {
       const size_t row = (size_t)y * width_;
       const bool is_own = y >= own.y0 && y < own.bottom();
       for (int x = inner.x0, k = 0; x < inner.right(); x += LANES, k += LANES) {
-        const vec s = step_at(y, x), v = load<vec>(raw.at(y, x)), is_ramp = load<vec>(ramp.at(y, x)), none = {}, one = broadcast(1.0f);
+        const vec s = step_at(y, x), v = load<vec>(raw.at(y, x)), is_ramp = load<vec>(ramp.at(y, x)), none = {},
+                  one = broadcast(1.0f);
         const auto is_valid = abs(v) <= LARGEST;
         vec near = load<vec>(nears[RINGS - 1].at(y, x)), far = load<vec>(fars[RINGS - 1].at(y, x)), unsure = {};
         if (!any_of((near + far > s) | (is_ramp > none))) {  // no step is large enough
@@ -659,16 +690,21 @@ class Repair {
         const auto is_edge = (is_ramp + unsure > none) & (near - far > s) & is_valid;
         const vec is_near = 2.0f * v > near + far ? one : none;
         const vec mark = (is_edge ? broadcast((float)EDGE) : none) + is_near * (float)NEAR + is_ramp * (float)RAMP;
-        store(marks_of_row + k, (is_edge | (is_ramp > none) ? mark : none) + (float)UNSURE * (is_valid & (is_ramp <= none) ? unsure : broadcast((float)(RINGS + 1))));
+        store(marks_of_row + k,
+              (is_edge | (is_ramp > none) ? mark : none) +
+                  (float)UNSURE * (is_valid & (is_ramp <= none) ? unsure : broadcast((float)(RINGS + 1))));
         const int first = std::max(0, own.x0 - x), last = std::min(LANES, std::min(inner.right(), own.right()) - x);
         int edges_here = is_own && first < last ? movemask(is_edge) & ((1 << last) - (1 << first)) : 0;
         if (!edges_here) continue;
         const vec gap = max(near - far, broadcast(1e-12f)), level = (v - far) / gap;
-        const vec right = load<vec>(high.at(y, x + 2)) - load<vec>(high.at(y, x - 2)), below = load<vec>(high.at(y + 2, x)) - load<vec>(high.at(y - 2, x));
+        const vec right = load<vec>(high.at(y, x + 2)) - load<vec>(high.at(y, x - 2)),
+                  below = load<vec>(high.at(y + 2, x)) - load<vec>(high.at(y - 2, x));
         const vec across = abs(right) > abs(below) + TIE * gap ? (right > none ? one : -one) : none;
         const vec along = abs(below) > abs(right) + TIE * gap ? (below > none ? one : -one) : none;
-        const vec on_ramp = 2.0f * RINGS + convert(convert(min(max(level * (float)LEVELS, none), broadcast(LEVELS - 1.0f))));
-        const vec place = is_ramp > none ? on_ramp : (level > 0.5f ? broadcast((float)RINGS) : none) + (float)RINGS - unsure;
+        const vec on_ramp =
+            2.0f * RINGS + convert(convert(min(max(level * (float)LEVELS, none), broadcast(LEVELS - 1.0f))));
+        const vec place =
+            is_ramp > none ? on_ramp : (level > 0.5f ? broadcast((float)RINGS) : none) + (float)RINGS - unsure;
         float nearest[LANES], farthest[LANES];
         int32_t kinds[LANES], sides[LANES];
         store(nearest, near);
@@ -678,7 +714,8 @@ class Repair {
         store(sides, kind + convert(is_near * (float)KINDS));
         for (; edges_here; edges_here &= edges_here - 1) {
           const int n = __builtin_ctz(edges_here);
-          if (found) measure(*found, level[n], is_near[n] > 0, climb(raw.at(y, x + n), -1, 1, -raw.pitch, raw.pitch, gap[n]));
+          if (found)
+            measure(*found, level[n], is_near[n] > 0, climb(raw.at(y, x + n), -1, 1, -raw.pitch, raw.pitch, gap[n]));
           if (!selected[sides[n]]) continue;
           edges.push_back({(int)row + x + n, nearest[n], farthest[n], (uint8_t)kinds[n]});
           marks_of_row[k + n] += (float)LISTED;
@@ -699,7 +736,8 @@ class Repair {
     found.lost += is_near - clamp01(level);
   }
 
-  // slope: the smaller change to both neighbours if these have one sign, else 0. jump: the larger change minus the slope.
+  // slope: the smaller change to both neighbours if these have one sign, else 0. jump: the larger change minus the
+  // slope.
   void slopes(const Grid &raw, const Grid &slope, const Grid &jump, const Part &part) const {
     const auto known = [](vec change) { return abs(change) <= FINITE ? change : vec{}; };
     each_vector(part, [&](int y, int x) {
@@ -716,8 +754,8 @@ class Repair {
 
   // Nearness at both ends of each ramp: near in `high`, far in `low`, negated. Clears the ramp mark on slopes, which do
   // not flatten within FLAT_REACH pixels.
-  void end_ramps(const Grid &up, const Grid &down, const Grid &slope, const Grid &high, const Grid &low, const Grid &rows, const Grid &ramp,
-                 const Part &ramps) const {
+  void end_ramps(const Grid &up, const Grid &down, const Grid &slope, const Grid &high, const Grid &low,
+                 const Grid &rows, const Grid &ramp, const Part &ramps) const {
     const Part around = ramps.grown(FLAT_REACH), inside = in_frame(ramps);
     clamp_to_frame(slope, around.grown(2));
     sums<2>(slope, high, rows, around, -1.0f / 25.0f);
@@ -730,7 +768,9 @@ class Repair {
     std::vector<Piece> pieces;
     for (int y = inside.y0; y < inside.bottom(); y++)
       for (int x = ramps.x0; x < ramps.right(); x += LANES) {
-        vec is_ramp = (load<vec>(ramp.at(y, x)) > vec{}) & (-load<vec>(low.at(y, x)) < FLAT * load<vec>(slope.at(y, x))) ? broadcast(1.0f) : vec{};
+        vec is_ramp = (load<vec>(ramp.at(y, x)) > vec{}) & (-load<vec>(low.at(y, x)) < FLAT * load<vec>(slope.at(y, x)))
+                          ? broadcast(1.0f)
+                          : vec{};
         if (x < inside.x0 || x + LANES > inside.right())
           for (int i = 0; i < LANES; i++)
             if (x + i < inside.x0 || x + i >= inside.right()) is_ramp[i] = 0;
@@ -738,7 +778,8 @@ class Repair {
         if (reduce_max(is_ramp) > 0) pieces.push_back(Piece{y, x, is_ramp, is_ramp});
       }
     for (int y = ramps.y0; y < ramps.bottom(); y++) {
-      if (y < inside.y0 || y >= inside.bottom()) std::fill(ramp.at(y, ramps.x0), ramp.at(y, ramps.x0) + ramps.width, 0.0f);
+      if (y < inside.y0 || y >= inside.bottom())
+        std::fill(ramp.at(y, ramps.x0), ramp.at(y, ramps.x0) + ramps.width, 0.0f);
       for (int x = ramps.x0 - 1; x < ramps.right() + 1 + LANES; x += LANES) {
         store(high.at(y, x), load<vec>(up.at(y, x)));
         store(low.at(y, x), load<vec>(down.at(y, x)));
@@ -768,12 +809,14 @@ class Repair {
   // For each edge: the score of its surfaces by colour and, if wanted, their nearness.
   void judge(std::vector<Group> &groups, bool wants_surfaces) const {
     // a pixel is not its own reference
-    const std::vector<float> falloff = window([](float square) { return square > 0 ? std::exp(-square / (2 * FALLOFF_PX * FALLOFF_PX)) : 0.0f; });
+    const std::vector<float> falloff =
+        window([](float square) { return square > 0 ? std::exp(-square / (2 * FALLOFF_PX * FALLOFF_PX)) : 0.0f; });
     parallel((int)groups.size(), [&](int g) {
       if (groups[g].edges.empty()) return;
       groups[g].judged.resize(groups[g].edges.size());
       groups[g].around.resize((groups[g].edges.size() + LANES - 1) / LANES);
-      channels_ == 3 ? judge<3>(groups[g], falloff.data(), wants_surfaces) : judge<0>(groups[g], falloff.data(), wants_surfaces);
+      channels_ == 3 ? judge<3>(groups[g], falloff.data(), wants_surfaces)
+                     : judge<0>(groups[g], falloff.data(), wants_surfaces);
     });
   }
 
@@ -798,7 +841,8 @@ class Repair {
     const int channels = C ? C : channels_, count = 4 + 2 * channels;
     const Part around = group.bounds.grown(REACH);
     const Grid given(around), witness(around), colour(around, channels);
-    for (int c = 0; c < channels; c++) fetch(map_.light + c * area_, colour, colour.at(around.y0, around.x0) + c * colour.size, root);
+    for (int c = 0; c < channels; c++)
+      fetch(map_.light + c * area_, colour, colour.at(around.y0, around.x0) + c * colour.size, root);
     fetch(map_.nearness, given, [this](float v) { return sign_ * valid(v); });
     fetch(marks_.data(), witness, [](uint8_t marks) { return (float)(marks / UNSURE); });
     float *sure = witness.at(around.y0, around.x0);
@@ -820,11 +864,14 @@ class Repair {
       vec *sums = C ? few : many.data();
       float *own = &of_lanes[count * LANES + lane];
       for (int n = 0; n < count; n++) sums[n] = none;
-      const float *given_at = given.at(y - REACH, x - REACH), *witness_at = witness.at(y - REACH, x - REACH), *colour_at = colour.at(y - REACH, x - REACH);
+      const float *given_at = given.at(y - REACH, x - REACH), *witness_at = witness.at(y - REACH, x - REACH),
+                  *colour_at = colour.at(y - REACH, x - REACH);
       for (int c = 0; c < channels; c++) own[c * LANES] = colour_at[c * colour.size + REACH * colour.pitch + REACH];
       each_of_window([&](int n, const auto &take) {
-        const vec value = take(given_at, given.pitch), weight = load<vec>(falloff + n * LANES) * take(witness_at, given.pitch), off = value - near;
-        const vec w[2] = {abs(off) < most_difference ? weight : none, abs(value - far) < most_difference ? weight : none};
+        const vec value = take(given_at, given.pitch),
+                  weight = load<vec>(falloff + n * LANES) * take(witness_at, given.pitch), off = value - near;
+        const vec w[2] = {abs(off) < most_difference ? weight : none,
+                          abs(value - far) < most_difference ? weight : none};
         vec apart = none;  // squared colour difference
         for (int c = 0; c < channels; c++) {
           const vec d = take(colour_at + c * colour.size, given.pitch) - own[c * LANES];
@@ -846,7 +893,8 @@ class Repair {
       const vec per_total[2] = {1.0f / of(0), 1.0f / of(1)};
       vec square = none, contrast = none, noise = none, from_mean[2] = {none, none}, along = none;
       for (int c = 0; c < channels; c++) {
-        const vec mine = of(count + c), near_off = of(4 + 2 * c) * per_total[0], far_off = of(5 + 2 * c) * per_total[1], both = 2.0f * mine + near_off + far_off;
+        const vec mine = of(count + c), near_off = of(4 + 2 * c) * per_total[0], far_off = of(5 + 2 * c) * per_total[1],
+                  both = 2.0f * mine + near_off + far_off;
         square += mine * mine;
         from_mean[0] += near_off * near_off;
         from_mean[1] += far_off * far_off;
@@ -861,7 +909,7 @@ class Repair {
       const vec reliability = is_known ? max(contrast / (contrast + 0.5f * spread) - 0.1f, none) / 0.9f : one;
       const vec share = max(min(along / max(contrast, broadcast(1e-12f)), one), none);
       const vec unmixed = 1.0f + max(from_mean[1] - share * (2.0f * along - share * contrast), none) / spread;
-      const vec mixed = wants_surfaces && map_.of_coc ? MIXTURE / (unmixed * unmixed) : none;
+      const vec mixed = wants_surfaces && map_.is_coc ? MIXTURE / (unmixed * unmixed) : none;
       float likely[2][LANES], surfaces[2][LANES], blurs[LANES], *around = group.around[k / LANES].alike[0];
       for (int l = 0; l <= lane; l++) {
         const Window &window = windows[l];
@@ -890,12 +938,15 @@ class Repair {
       for (int side = 0; side < 2; side++) likelihood[side] = load<vec>(likely[side]) * per_total[side] + 1e-9f;
       likelihood[0] += mixed * load<vec>(blurs);
       const vec likeliest = is_known ? min(max(likelihood[0], likelihood[1]) / LIKELY, one) : one;
-      const vec odds = likelihood[0] / likelihood[1], clear = min(min(of(0), of(1)) / (wants_surfaces ? CLEAR : CLEAR_IN_PRIOR), one);
+      const vec odds = likelihood[0] / likelihood[1],
+                clear = min(min(of(0), of(1)) / (wants_surfaces ? CLEAR : CLEAR_IN_PRIOR), one);
       for (int l = 0; l <= lane; l++) {
         const Edge &edge = group.edges[k - lane + l];
-        score_[edge.i] = is_known[l] ? std::clamp(std::log(odds[l]), -8.0f, 8.0f) * (marks_[edge.i] & RAMP ? 1.0f : clear[l]) : 0.0f;
+        score_[edge.i] =
+            is_known[l] ? std::clamp(std::log(odds[l]), -8.0f, 8.0f) * (marks_[edge.i] & RAMP ? 1.0f : clear[l]) : 0.0f;
         evidence_[edge.i] = likeliest[l];
-        group.judged[k - lane + l] = {0.0f, reliability[l], is_known[l] ? surfaces[0][l] : edge.near, is_known[l] ? surfaces[1][l] : edge.far};
+        group.judged[k - lane + l] = {0.0f, reliability[l], is_known[l] ? surfaces[0][l] : edge.near,
+                                      is_known[l] ? surfaces[1][l] : edge.far};
       }
     });
   }
@@ -953,14 +1004,19 @@ class Repair {
     for (const Group &group : groups)
       for (size_t k = 0; k < group.edges.size(); k++) {
         const Edge &edge = group.edges[k];
-        const float score = group.judged[k].score, level = (nearness(edge.i) - edge.far) / std::max(edge.near - edge.far, 1e-12f);
-        if (marks_[edge.i] & RAMP ? std::fabs(level - 0.5f) <= CLEAR_LEVEL : edge.kind / DIRECTIONS % RINGS != RINGS - 1) continue;
+        const float score = group.judged[k].score,
+                    level = (nearness(edge.i) - edge.far) / std::max(edge.near - edge.far, 1e-12f);
+        if (marks_[edge.i] & RAMP ? std::fabs(level - 0.5f) <= CLEAR_LEVEL
+                                  : edge.kind / DIRECTIONS % RINGS != RINGS - 1)
+          continue;
         const float weight = std::min(0.5f * std::fabs(score), 1.0f);
         const bool is_near = level > 0.5f;
         total[is_near] += weight;
         if ((score > 0) == is_near) agreed[is_near] += weight;
       }
-    const auto agrees = [&](bool side) { return (agreed[side] + 0.25f * PRIOR_COUNT) / (total[side] + 0.5f * PRIOR_COUNT) > RELATED; };
+    const auto agrees = [&](bool side) {
+      return (agreed[side] + 0.25f * PRIOR_COUNT) / (total[side] + 0.5f * PRIOR_COUNT) > RELATED;
+    };
     return agrees(false) || agrees(true);
   }
 
@@ -981,7 +1037,8 @@ class Repair {
         observed.odds.push_back(std::exp(-score));
       }
     for (Observations &observed : observations)
-      for (std::vector<float> *values : {&observed.weights, &observed.odds}) values->resize((values->size() + LANES - 1) / LANES * LANES);
+      for (std::vector<float> *values : {&observed.weights, &observed.odds})
+        values->resize((values->size() + LANES - 1) / LANES * LANES);
     const std::vector<float> together = fit(observations, DIRECTIONS, start, assumed);
     std::vector<float> each(KINDS);
     for (int k = 0; k < KINDS; k++) each[k] = together[k / DIRECTIONS];
@@ -993,7 +1050,8 @@ class Repair {
     std::vector<float> weights, odds;
   };
 
-  static std::vector<float> fit(const std::vector<Observations> &observations, int together, std::vector<float> share, const std::vector<float> &assumed) {
+  static std::vector<float> fit(const std::vector<Observations> &observations, int together, std::vector<float> share,
+                                const std::vector<float> &assumed) {
     const auto sum_of = [&](size_t first, const auto &part) {
       double totals[LANES] = {}, total = 0;
       for (size_t kind = first; kind < first + together; kind++)
@@ -1009,7 +1067,8 @@ class Repair {
       const double total = sum_of(g * together, [](vec weight, vec) { return weight; });
       for (int round = 0; round < ROUNDS; round++) {
         const float odds = (1.0f - share[g]) / share[g];
-        const double found = sum_of(g * together, [&](vec weight, vec other) { return weight / (1.0f + odds * other); });
+        const double found =
+            sum_of(g * together, [&](vec weight, vec other) { return weight / (1.0f + odds * other); });
         share[g] = std::clamp((float)((found + PRIOR_COUNT * assumed[g]) / (total + PRIOR_COUNT)), 0.005f, 0.995f);
       }
     }
@@ -1022,23 +1081,25 @@ class Repair {
     return std::clamp((float)std::sqrt(std::max(width * width - PIXEL, 0.0)), LEAST_BLUR_PX, MOST_BLUR_PX);
   }
 
-  // Decides which surface pixels show, and moves them to its nearness; on ramps in proportion to the evidence. Returns the
-  // width, in pixels, by which the map's near surfaces are too thin.
+  // Decides which surface pixels show, and moves them to its nearness; on ramps in proportion to the evidence. Returns
+  // the width, in pixels, by which the map's near surfaces are too thin.
   float move(const std::vector<Group> &groups, bool is_soft) const {
-    const float lean = map_.automatic ? LEAN : 0.0f, to_blurred = map_.automatic && map_.of_coc ? TO_BLURRED : 0.0f;
+    const float lean = map_.automatic ? LEAN : 0.0f, to_blurred = map_.automatic && map_.is_coc ? TO_BLURRED : 0.0f;
     float prior[KINDS];
     for (int k = 0; k < KINDS; k++) prior[k] = std::log(shares_[k] / (1.0f - shares_[k]));
     const auto odds = [&](const Group &group, size_t k) {
       const float score = group.judged[k].score;
       const Edge &edge = group.edges[k];
-      return score + prior[edge.kind] + lean * clamp01(std::fabs(score) - 1.0f) + (is_soft ? to_blurred * more_blurred(edge) : 0.0f);
+      return score + prior[edge.kind] + lean * clamp01(std::fabs(score) - 1.0f) +
+             (is_soft ? to_blurred * more_blurred(edge) : 0.0f);
     };
     std::vector<std::vector<float>> chances(groups.size());
     for (int round = 0; is_soft && round < DECIDED_ROUNDS; round++) {
       parallel((int)groups.size(), [&](int g) {
         chances[g].resize(groups[g].edges.size());
         for (size_t k = 0; k < chances[g].size(); k++)
-          chances[g][k] = 1.0f / (1.0f + std::exp(-odds(groups[g], k) - (round ? neighbours(groups[g].edges[k]) : 0.0f)));
+          chances[g][k] =
+              1.0f / (1.0f + std::exp(-odds(groups[g], k) - (round ? neighbours(groups[g].edges[k]) : 0.0f)));
       });
       parallel((int)groups.size(), [&](int g) {
         for (size_t k = 0; k < chances[g].size(); k++) score_[groups[g].edges[k].i] = chances[g][k];
@@ -1068,15 +1129,17 @@ class Repair {
   float neighbours(const Edge &edge) const {
     float odds = 0;
     for (const auto &[dy, dx] : NEIGHBOURS) {
-      const int at = std::clamp(edge.i / width_ + dy, 0, height_ - 1) * width_ + std::clamp(edge.i % width_ + dx, 0, width_ - 1);
+      const int at =
+          std::clamp(edge.i / width_ + dy, 0, height_ - 1) * width_ + std::clamp(edge.i % width_ + dx, 0, width_ - 1);
       const bool is_near = sign_ * valid(map_.nearness[at]) > 0.5f * (edge.near + edge.far);
-      odds += (dy * dx ? DIAGONAL : BESIDE) * (2.0f * (marks_[at] & LISTED ? score_[at] : (float)is_near) - 1.0f);
+      odds += (dy && dx ? DIAGONAL : BESIDE) * (2.0f * (marks_[at] & LISTED ? score_[at] : (float)is_near) - 1.0f);
     }
     return odds;
   }
 
   // Removes rims beside steps that are a little nearer, or farther, than the surface to which they belong: the ringing
-  // of interpolation. Such pixels move to the closer end of the range between the closed opening and the opened closing.
+  // of interpolation. Such pixels move to the closer end of the range between the closed opening and the opened
+  // closing.
   void remove_ringing() {
     memcpy(evidence_.data(), map_.out, area_ * sizeof(float));
     const std::vector<Group> parts = tiles();
@@ -1136,7 +1199,8 @@ class Repair {
     const int pitches[2] = {blurred.pitch, shape.pitch};
     vec of_y[2] = {}, of_covers[2][3] = {};  // weighted sums of y, y y; and of x, x x, x y for both shapes
     each_of_window([&](int n, const auto &take) {
-      const vec weight = load<vec>(weights + n * LANES), none = {}, cy = take(given_at, given.pitch) - own, wy = weight * cy;
+      const vec weight = load<vec>(weights + n * LANES), none = {}, cy = take(given_at, given.pitch) - own,
+                wy = weight * cy;
       of_y[0] += wy;
       of_y[1] += wy * cy;
       for (int i = 0; i < 2; i++) {
@@ -1154,14 +1218,17 @@ class Repair {
       both[i] = std::max(reduce_add(of_covers[i][2]) - mean_x[i] * mean_y, 0.0f);
       explained[i] = both[i] * both[i] / std::max(of_x[i] * yy, 1e-12f);
     }
-    const float b = both[0] / std::max(of_x[0], 1e-9f), better = clamp01((explained[0] - explained[1]) / std::max(BETTER * (1.0f - explained[1]), 1e-6f));
-    return {mean_y - b * mean_x[0] + own, b, of_x[0] > 0.004f ? clamp01((explained[0] - EXPLAINED) / EXPLAINED_MORE) * better : 0.0f};
+    const float b = both[0] / std::max(of_x[0], 1e-9f),
+                better = clamp01((explained[0] - explained[1]) / std::max(BETTER * (1.0f - explained[1]), 1e-6f));
+    return {mean_y - b * mean_x[0] + own, b,
+            of_x[0] > 0.004f ? clamp01((explained[0] - EXPLAINED) / EXPLAINED_MORE) * better : 0.0f};
   }
 
   // Raises the nearness of lamps of a few pixels, which a soft map averages with their surroundings.
   void lift_lamps(float sigma, float lost_px) const {
     const std::vector<float> weights = even_window();
-    const float is_lost = clamp01(2.4f + 2.5f * lost_px);  // 0 if the map's near surfaces are 1 px too wide: then it has lost no lamps
+    const float is_lost =
+        clamp01(2.4f + 2.5f * lost_px);  // 0 if the map's near surfaces are 1 px too wide: then it has lost no lamps
     const std::vector<Group> all_parts = tiles();
     const int reach = blur_reach(sigma);
     parallel((int)all_parts.size(), [&](int g) {
@@ -1182,7 +1249,8 @@ class Repair {
       max_filter<2>(bright, peak, rows, covered);
       each_vector(covered, [&](int y, int x) {
         const vec own = load<vec>(bright.at(y, x));
-        store(usual.at(y, x), own > 2.0f * load<vec>(usual.at(y, x)) ? own / max(load<vec>(peak.at(y, x)), broadcast(1e-30f)) : vec{});
+        store(usual.at(y, x),
+              own > 2.0f * load<vec>(usual.at(y, x)) ? own / max(load<vec>(peak.at(y, x)), broadcast(1e-30f)) : vec{});
       });
       clamp_to_frame(usual, covered);
       gaussian(usual, blurred, rows, around, sigma);
@@ -1203,10 +1271,13 @@ class Repair {
         float sums[3] = {0, 0, 0};
         for (int v = y - LAMP_REACH; v <= y + LAMP_REACH; v++)
           for (int u = x - LAMP_REACH; u <= x + LAMP_REACH; u++)
-            for (int n = 0; n < 3; n++) sums[n] += lamps.at(std::min(std::max(v, 0), height_ - 1), std::min(std::max(u, 0), width_ - 1))[n * lamps.size];
+            for (int n = 0; n < 3; n++)
+              sums[n] +=
+                  lamps.at(std::min(std::max(v, 0), height_ - 1), std::min(std::max(u, 0), width_ - 1))[n * lamps.size];
         const float per_weight = 1.0f / std::max(sums[0], 1e-9f);
         const float repaired = sign_ * map_.out[lamp.i];
-        map_.out[lamp.i] = sign_ * (repaired + sums[2] * per_weight * is_lost * std::max(sums[1] * per_weight - repaired, 0.0f));
+        map_.out[lamp.i] =
+            sign_ * (repaired + sums[2] * per_weight * is_lost * std::max(sums[1] * per_weight - repaired, 0.0f));
       });
     });
   }
@@ -1227,7 +1298,8 @@ class Repair {
       for (int x = 0; x < bright.pitch; x++) roots[x] = std::sqrt(to[x]);
     }
     sums<USUAL_REACH>(light, usual, rows, part, 1.0f / ((2 * USUAL_REACH + 1) * (2 * USUAL_REACH + 1)));
-    each_vector(part, [&](int y, int x) { store(usual.at(y, x), load<vec>(usual.at(y, x)) * load<vec>(usual.at(y, x))); });
+    each_vector(part,
+                [&](int y, int x) { store(usual.at(y, x), load<vec>(usual.at(y, x)) * load<vec>(usual.at(y, x))); });
   }
 
   // The pixels of lamps in a part; up: nearness of the part and of REACH pixels around it.
@@ -1236,7 +1308,9 @@ class Repair {
     const Grid bright(whole), usual(part), rows(whole);
     brightest(bright, usual, rows, part);
     vec any{};
-    each_vector(part, [&](int y, int x) { any = max(any, load<vec>(bright.at(y, x)) > 4.0f * load<vec>(usual.at(y, x)) ? broadcast(1.0f) : vec{}); });
+    each_vector(part, [&](int y, int x) {
+      any = max(any, load<vec>(bright.at(y, x)) > 4.0f * load<vec>(usual.at(y, x)) ? broadcast(1.0f) : vec{});
+    });
     std::vector<Edge> found;
     if (!(reduce_max(any) > 0)) return found;
     const Part &around = up;
@@ -1249,7 +1323,8 @@ class Repair {
       for (int x = part.x0; x < part.right(); x++) {
         const size_t i = (size_t)y * width_ + x;
         const float own = *bright.at(y, x);
-        if (own > 4.0f * *usual.at(y, x) && own > 0.1f * *peak.at(y, x) && *high.at(y, x) + *low.at(y, x) > 0.5f * step(i) && std::fabs(map_.nearness[i]) <= LARGEST)
+        if (own > 4.0f * *usual.at(y, x) && own > 0.1f * *peak.at(y, x) &&
+            *high.at(y, x) + *low.at(y, x) > 0.5f * step(i) && std::fabs(map_.nearness[i]) <= LARGEST)
           found.push_back({(int)i, 0, 0, 0});
       }
     return found;
@@ -1262,7 +1337,8 @@ class Repair {
   void gaussian(const Grid &in, const Grid &out, const Grid &rows, const Part &part, float sigma) const {
     const int reach = blur_reach(sigma);
     float kernel[BLUR_REACH + 1], total = 0;
-    for (int d = -reach; d <= reach; d++) total += kernel[std::abs(d)] = std::exp(-(float)(d * d) / (2.0f * sigma * sigma));
+    for (int d = -reach; d <= reach; d++)
+      total += kernel[std::abs(d)] = std::exp(-(float)(d * d) / (2.0f * sigma * sigma));
     for (int d = 0; d <= reach; d++) kernel[d] /= total;
     each_vector({part.y0 - reach, part.x0, part.height + 2 * reach, part.width}, [&](int y, int x) {
       const float *from = in.at(y, x);
@@ -1274,7 +1350,8 @@ class Repair {
     each_vector(part, [&](int y, int x) {
       const float *from = rows.at(y, x);
       vec spread = kernel[0] * load<vec>(from);
-      for (int d = 1; d <= reach; d++) spread += kernel[d] * (load<vec>(from - d * rows.pitch) + load<vec>(from + d * rows.pitch));
+      for (int d = 1; d <= reach; d++)
+        spread += kernel[d] * (load<vec>(from - d * rows.pitch) + load<vec>(from + d * rows.pitch));
       store(out.at(y, x), spread);
     });
     clamp_to_frame(out, part);

@@ -32,7 +32,8 @@ Job::Job(const torchdof_scene &scene)
     l.scale = scene.scales[k];
     l.half = scene.halves[k];
     const int side = 2 * l.half + 1;
-    for (int e = 0; e < colours; e++, values += side * side) l.kernels.push_back(make_kernel(values, l.half, !scene.field_masks));
+    for (int e = 0; e < colours; e++, values += side * side)
+      l.kernels.push_back(make_kernel(values, l.half, !scene.field_masks));
     if (scene.field_masks && l.half) {
       l.field_mask = scene.field_masks + k;
       l.spots = ends_dark(*l.field_mask, scene.distances);
@@ -97,7 +98,8 @@ void Job::take_scene() {
   float nearest, farthest, darkest = 0, brightest = 0;
   find_ends(surfaces.coc, area, scene.threads, &nearest, &farthest);
   if (scene.masked) find_ends(surfaces.light, area * channels, scene.threads, &darkest, &brightest);
-  const bool bad = scene.masked && !(std::isfinite(nearest) && std::isfinite(farthest) && std::isfinite(darkest) && std::isfinite(brightest));
+  const bool bad = scene.masked && !(std::isfinite(nearest) && std::isfinite(farthest) && std::isfinite(darkest) &&
+                                     std::isfinite(brightest));
   if (bad || !(nearest >= low && farthest <= high)) {
     clean_coc = Buffer<float>(area);
     clean_light = Buffer<float>(bad ? area * channels : 0);
@@ -121,11 +123,13 @@ void Job::take_scene() {
   std::vector<float> leasts((size_t)channels * surfaces.block_rows, INFINITY), mosts(leasts.size(), -INFINITY);
   parallel(surfaces.block_rows, [&](int by, int) {
     const size_t first = (size_t)by * surfaces.block_columns;
-    ends_of(surfaces.coc + (size_t)by * BLOCK * width, width, std::min(BLOCK, height - by * BLOCK), &block_low[first], &block_high[first]);
+    ends_of(surfaces.coc + (size_t)by * BLOCK * width, width, std::min(BLOCK, height - by * BLOCK), &block_low[first],
+            &block_high[first]);
     float *const peaks = &block_peak[first];
     std::vector<float> lows(surfaces.block_columns), highs(surfaces.block_columns);
     for (int c = 0; c < channels; c++) {
-      ends_of(surfaces.light + c * area + (size_t)by * BLOCK * width, width, std::min(BLOCK, height - by * BLOCK), lows.data(), highs.data());
+      ends_of(surfaces.light + c * area + (size_t)by * BLOCK * width, width, std::min(BLOCK, height - by * BLOCK),
+              lows.data(), highs.data());
       for (int i = 0; i < surfaces.block_columns; i++) peaks[i] = c ? std::max(peaks[i], highs[i]) : highs[i];
       leasts[by * channels + c] = *std::min_element(lows.begin(), lows.end());
       mosts[by * channels + c] = *std::max_element(highs.begin(), highs.end());
@@ -137,7 +141,8 @@ void Job::take_scene() {
     light_least[i % channels] = std::min(light_least[i % channels], leasts[i]);
     light_most[i % channels] = std::max(light_most[i % channels], mosts[i]);
   }
-  constexpr float BRIGHTEST = 1 << (std::numeric_limits<float>::max_exponent - constants::exposure::SUMMED) / 4;  // fourth powers are summed
+  constexpr float BRIGHTEST =
+      1 << (std::numeric_limits<float>::max_exponent - constants::exposure::SUMMED) / 4;  // fourth powers are summed
   for (int c = 0; c < channels; c++)
     if (std::max(light_most[c], -light_least[c]) > BRIGHTEST) throw TooBright();
   if (surfaces.valid)

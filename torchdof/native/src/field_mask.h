@@ -20,7 +20,8 @@ class FieldMask {
   static constexpr float LEAST = constants::placed_kernels::MIN_LIGHT;
 
   // For the samples a, or the mix of a and b with weight `part` of b. y, x: position in half diagonals from the centre.
-  FieldMask(const torchdof_scene &scene, const torchdof_field_mask &a, const torchdof_field_mask *b, float part, int colour, float y, float x)
+  FieldMask(const torchdof_scene &scene, const torchdof_field_mask &a, const torchdof_field_mask *b, float part,
+            int colour, float y, float x)
       : squeeze_(scene.squeeze), part_(part), both_(b != nullptr) {
     x += ASIDE;
     const float distance = std::sqrt(y * y + x * x), place = std::min(distance, 1.0f) * (scene.distances - 1);
@@ -51,7 +52,8 @@ class FieldMask {
   }
   // Transmittance at offsets from the kernel's centre.
   vec transmittance(vec dy, vec dx) const {
-    const vec across = dx * squeeze_, u = dy * down_ + across * right_, v = abs(across * down_ - dy * right_), first = samples_[0].at(u, v);
+    const vec across = dx * squeeze_, u = dy * down_ + across * right_, v = abs(across * down_ - dy * right_),
+              first = samples_[0].at(u, v);
     return both_ ? (1.0f - part_) * first + part_ * samples_[1].at(u, v) : first;
   }
   // Range of rows of a column that the samples cover.
@@ -75,19 +77,23 @@ class FieldMask {
     float near, last_row, last_column, per_u, first_u, per_v;
     vec at(vec u, vec v) const {
       // NaN becomes 0
-      const vec row = min(max(u * per_u + first_u, vec{}), broadcast(last_row)), column = min(max(v * per_v, vec{}), broadcast(last_column));
-      const ivec i = convert(min(row, broadcast(last_row - 1.0f))), j = convert(min(column, broadcast(last_column - 1.0f)));
+      const vec row = min(max(u * per_u + first_u, vec{}), broadcast(last_row)),
+                column = min(max(v * per_v, vec{}), broadcast(last_column));
+      const ivec i = convert(min(row, broadcast(last_row - 1.0f))),
+                 j = convert(min(column, broadcast(last_column - 1.0f)));
       const vec down = row - convert(i), right = column - convert(j);
       const ivec first = i * columns + j;
       vec mean[2];
       for (int k = 0; k < 2; k++) {
         const float *p = k ? next : values;
-        vec corner[4];
+        vec corner[4] = {};
         for (int lane = 0; lane < LANES; lane++) {
           const float *from = p + first[lane];
-          corner[0][lane] = from[0], corner[1][lane] = from[1], corner[2][lane] = from[columns], corner[3][lane] = from[columns + 1];
+          corner[0][lane] = from[0], corner[1][lane] = from[1], corner[2][lane] = from[columns],
+          corner[3][lane] = from[columns + 1];
         }
-        const vec upper = corner[0] + right * (corner[1] - corner[0]), lower = corner[2] + right * (corner[3] - corner[2]);
+        const vec upper = corner[0] + right * (corner[1] - corner[0]),
+                  lower = corner[2] + right * (corner[3] - corner[2]);
         mean[k] = upper + down * (lower - upper);
       }
       return clamp01(mean[0] + near * (mean[1] - mean[0]));

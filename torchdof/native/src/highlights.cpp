@@ -41,7 +41,7 @@ constexpr int TAPS_PER_PIXEL = constants::highlights::TAPS_PER_PIXEL;
 constexpr int THRESHOLD_CELL = STEP * CELL_STEPS;
 constexpr double FREE_CHANGE_PX = constants::highlights::FREE_CHANGE_PX;
 constexpr int KERNELS_PER_PX = constants::plan::KERNELS_PER_PX;
-constexpr int PATCH = 16;               // side in pixels of the squares in which rays are processed
+constexpr int PATCH = 16;  // side in pixels of the squares in which rays are processed
 
 struct Candidate {
   int row, column;
@@ -94,11 +94,15 @@ float threshold_at(const Job &job, int y, int x) {
 }
 
 float least_threshold(const Job &job, int y0, int x0) {
-  auto cell = [](int at, int before, int count) { return std::clamp((at + before - THRESHOLD_CELL / 2) / THRESHOLD_CELL, 0, count - 1); };
-  const int rows = job.threshold_rows, columns = job.threshold_columns, top = job.threshold_top, left = job.threshold_left;
+  auto cell = [](int at, int before, int count) {
+    return std::clamp((at + before - THRESHOLD_CELL / 2) / THRESHOLD_CELL, 0, count - 1);
+  };
+  const int rows = job.threshold_rows, columns = job.threshold_columns, top = job.threshold_top,
+            left = job.threshold_left;
   float least = INFINITY;
   for (int row = cell(y0, top, rows); row <= std::min(cell(y0 + BLOCK, top, rows) + 1, rows - 1); row++)
-    for (int column = cell(x0, left, columns); column <= std::min(cell(x0 + BLOCK, left, columns) + 1, columns - 1); column++)
+    for (int column = cell(x0, left, columns); column <= std::min(cell(x0 + BLOCK, left, columns) + 1, columns - 1);
+         column++)
       least = std::min(least, job.threshold[(size_t)row * columns + column]);
   return least;
 }
@@ -119,13 +123,15 @@ void Job::find_threshold() {
       for (int column = 0; column < threshold_columns; column++)
         for (int j = 0; j < CELL_STEPS; j++) {
           const size_t at = (size_t)y * width + xs[column * CELL_STEPS + j];
-          brightest[(size_t)column * VECTORS * LANES + i * CELL_STEPS + j] = valid && !(valid[at] > 0) ? INFINITY : peak_of(light + at, area, channels);
+          brightest[(size_t)column * VECTORS * LANES + i * CELL_STEPS + j] =
+              valid && !(valid[at] > 0) ? INFINITY : peak_of(light + at, area, channels);
         }
     }
     const float largest = 3.4028234663852886e38f;
     for (int column = 0; column < threshold_columns; column++)
       threshold[(size_t)row * threshold_columns + column] =
-          FACTOR * std::min(ranked(COUNT / BRIGHT_PART, &brightest[(size_t)column * VECTORS * LANES], VECTORS), largest / FACTOR);
+          FACTOR * std::min(ranked(COUNT / BRIGHT_PART, &brightest[(size_t)column * VECTORS * LANES], VECTORS),
+                            largest / FACTOR);
   });
 }
 
@@ -175,7 +181,8 @@ void Job::extract_highlights() {
       if (!surfaces.full_planes()) {
         vec peak = broadcast(block_peak[block]);
         const float *of_block = surfaces.blocks[block];  // light of both surfaces comes first
-        for (int i = 0; of_block && i < 2 * channels * BLOCK_PIXELS; i += LANES) peak = max(peak, load<vec>(of_block + i));
+        for (int i = 0; of_block && i < 2 * channels * BLOCK_PIXELS; i += LANES)
+          peak = max(peak, load<vec>(of_block + i));
         if (!any_of(peak > least_limit)) continue;
       }
       for (int y = by * BLOCK; y < std::min(height, (by + 1) * BLOCK); y++) {
@@ -184,18 +191,22 @@ void Job::extract_highlights() {
           for (int x = 0; x < n; x++) {
             float brightest = light[0][x];
             for (int c = 1; c < channels; c++) brightest = std::max(brightest, light[c][x]);
-            if (!(brightest > least_limit) || (weight && !(weight[x] > HIDDEN_WEIGHT)) || !(std::fabs(coc[x]) > from_px)) continue;
+            if (!(brightest > least_limit) || (weight && !(weight[x] > HIDDEN_WEIGHT)) ||
+                !(std::fabs(coc[x]) > from_px))
+              continue;
             const float limit = threshold_at(*this, y, x0 + x);
             if (!(brightest > limit)) continue;
             float part = weight ? weight[x] : 1.0f;
-            if (!surfaces.full_planes() && surfaces.has_block(block)) part = part_sent(surfaces, channels, i, y, x0 + x, coc[x], limit);
+            if (!surfaces.full_planes() && surfaces.has_block(block))
+              part = part_sent(surfaces, channels, i, y, x0 + x, coc[x], limit);
             bands[(size_t)i * surfaces.block_rows + by].push_back({y, x0 + x, brightest, coc[x], limit, part});
           }
         }
       }
     }
   });
-  const bool any = std::any_of(bands.begin(), bands.end(), [](const std::vector<Candidate> &band) { return !band.empty(); });
+  const bool any =
+      std::any_of(bands.begin(), bands.end(), [](const std::vector<Candidate> &band) { return !band.empty(); });
   double budget = (double)TAPS_PER_PIXEL * area;
   if (any && scene.occlusion) {
     const double crowd = std::max(mean_change(surfaces.coc, height, width, scene.threads) / FREE_CHANGE_PX, 1.0);
@@ -217,7 +228,8 @@ void Job::extract_highlights() {
     };
     double taps_of_all = 0;
     for (const Candidate &p : all) taps_of_all += taps(p);
-    if (taps_of_all > budget) {  // over budget: keep only the brightest, and of these only the light above a common limit
+    if (taps_of_all >
+        budget) {  // over budget: keep only the brightest, and of these only the light above a common limit
       std::vector<Candidate> sorted(all);
       std::sort(sorted.begin(), sorted.end(), [](const Candidate &a, const Candidate &b) { return a.peak > b.peak; });
       double least = 0, sum = 0, slope = 0;
@@ -228,7 +240,8 @@ void Job::extract_highlights() {
         least = std::min((sum - budget) / slope, (double)sorted[k].peak);
         break;
       }
-      all.erase(std::remove_if(all.begin(), all.end(), [&](const Candidate &p) { return !(p.peak > least); }), all.end());
+      all.erase(std::remove_if(all.begin(), all.end(), [&](const Candidate &p) { return !(p.peak > least); }),
+                all.end());
       for (Candidate &p : all) p.limit = std::max(p.limit, (float)least);
     }
     for (const Candidate &p : all) {
@@ -252,7 +265,8 @@ void Job::extract_highlights() {
 }
 
 // Calls body(is_own, coc, weight, least_weight) for the surfaces shown in a row of a block column, from column x. A
-// surface covers weight - least_weight of a pixel (weight null: 1), so that hidden surfaces cover nothing. Both are BLOCK values.
+// surface covers weight - least_weight of a pixel (weight null: 1), so that hidden surfaces cover nothing. Both are
+// BLOCK values.
 template <typename Body>
 static void each_shown(const Surfaces &surfaces, int y, int x, const float **light, const Body &body) {
   const int own = surfaces.full_planes() ? 1 : 0;  // with a given background the first plane is the other surface
@@ -271,7 +285,9 @@ static void each_shown(const Surfaces &surfaces, int y, int x, const float **lig
 }
 
 // Half width of a ray's kernel.
-static int half_of(const RayKernels &kernels, const Ray &ray) { return std::max(kernels.halves[ray.radius], kernels.halves[ray.radius + 1]); }
+static int half_of(const RayKernels &kernels, const Ray &ray) {
+  return std::max(kernels.halves[ray.radius], kernels.halves[ray.radius + 1]);
+}
 
 // For each cell the number of rays that may cross it on surfaces with coc `low` or larger.
 static std::vector<int> passing(const Job &job, const RayKernels &kernels, float low, int cell_rows, int cell_columns) {
@@ -280,7 +296,8 @@ static std::vector<int> passing(const Job &job, const RayKernels &kernels, float
     if (row < cell_rows && column < cell_columns) count[(size_t)row * cell_columns + column] += n;
   };
   for (const Ray &ray : job.rays) {
-    const int reach = (int)std::min(half_of(kernels, ray) * std::fabs(1.0f - low / ray.coc), (float)(job.height + job.width)) + 3;
+    const int reach =
+        (int)std::min(half_of(kernels, ray) * std::fabs(1.0f - low / ray.coc), (float)(job.height + job.width)) + 3;
     const int r0 = std::max(ray.row - reach, 0) / CELL, r1 = std::min(ray.row + reach, job.height - 1) / CELL + 1;
     const int c0 = std::max(ray.column - reach, 0) / CELL, c1 = std::min(ray.column + reach, job.width - 1) / CELL + 1;
     add(r0, c0, 1), add(r0, c1, -1), add(r1, c0, -1), add(r1, c1, 1);
@@ -316,7 +333,9 @@ Visibility find_visibility(const Job &job, const RayKernels &kernels) {
   };
   auto add_bits = [&](Bits &bits, vec coc, ivec shown) {
     const vec place = min(max(coc - low, vec{}), broadcast(high - low));
-    auto bit = [&](ivec which) { return __builtin_convertvector(shown, wide) & ((wide{} + 1) << __builtin_convertvector(which, wide)); };
+    auto bit = [&](ivec which) {
+      return __builtin_convertvector(shown, wide) & ((wide{} + 1) << __builtin_convertvector(which, wide));
+    };
     bits.classes |= bit(min(convert(place * (1.0f / v.class_width)), ivec{} + (v.CLASSES - 1)));
     // at a bin's border both bins, because rays compute the distance from it with another rounding error
     for (const float border : {-1 / 16.0f, 1 / 16.0f}) bits.remainders |= bit(convert(max(place + border, vec{})) & 63);
@@ -336,11 +355,13 @@ Visibility find_visibility(const Job &job, const RayKernels &kernels) {
       for (Bits &of_cell : bits)
         for (float coc : ends) add_bits(of_cell, broadcast(coc), ivec{} - flat);
       for (int y = row * CELL; y < std::min(H, (row + 1) * CELL) && !(flat && !surfaces.has_block(block)); y++)
-        each_shown(surfaces, y, x, light.data(), [&](bool own, const float *coc, const float *weight, float least_weight) {
-          if (own && flat) return;
-          for (int j = 0; j < BLOCK; j += LANES)
-            add_bits(bits[j / CELL], load<vec>(coc + j), weight ? load<vec>(weight + j) > least_weight : ivec{} == 0);
-        });
+        each_shown(surfaces, y, x, light.data(),
+                   [&](bool own, const float *coc, const float *weight, float least_weight) {
+                     if (own && flat) return;
+                     for (int j = 0; j < BLOCK; j += LANES)
+                       add_bits(bits[j / CELL], load<vec>(coc + j),
+                                weight ? load<vec>(weight + j) > least_weight : ivec{} == 0);
+                   });
       for (int j = 0; j < n; j += CELL)
         for (int i = 0; i < LANES; i++) {
           cells[(x + j) / CELL].classes |= bits[j / CELL].classes[i];
@@ -359,7 +380,8 @@ namespace {
 
 // Coverage of a row of pixels, from a block column, by surfaces within 1 px of coc `place`; returns whether there is
 // any.
-bool cover_row(const Job &job, int y, int block_column, int block_columns, float place, const float **light, float *covered) {
+bool cover_row(const Job &job, int y, int block_column, int block_columns, float place, const float **light,
+               float *covered) {
   vec most_cover = {};
   for (int i = 0; i < block_columns; i++, covered += BLOCK) {
     const int x = (block_column + i) * BLOCK;
@@ -378,8 +400,8 @@ bool cover_row(const Job &job, int y, int block_column, int block_columns, float
 }
 
 // Adds, for rays that land in a patch of rows x columns pixels at y, x, the share blocked by surfaces of bin k.
-void add_blocked(const Job &job, const Visibility &v, const Ray &ray, int k, int y, int x, int rows, int columns, const float **light,
-                 float (*blocked)[PATCH]) {
+void add_blocked(const Job &job, const Visibility &v, const Ray &ray, int k, int y, int x, int rows, int columns,
+                 const float **light, float (*blocked)[PATCH]) {
   constexpr int LONGEST = 256;  // columns of the image processed together
   const int H = job.height, W = job.width;
   const float place = v.low + k, fades = clamp01(ray.coc - NEARER_PX - place), along = 1.0f - place / ray.coc;
@@ -405,7 +427,8 @@ void add_blocked(const Job &job, const Visibility &v, const Ray &ray, int k, int
     const Visibility::Cell *cells = &v.cells[(size_t)cell_row * v.cell_columns];
     for (int i = 0; i < columns; i++) {
       const int cell = column[i] / CELL, next = std::min(column[i] + 1, W - 1) / CELL;
-      crosses[i] = v.may_show(cells[cell], classes, remainders) || (next > cell && v.may_show(cells[next], classes, remainders));
+      crosses[i] =
+          v.may_show(cells[cell], classes, remainders) || (next > cell && v.may_show(cells[next], classes, remainders));
     }
   };
   auto take_row = [&](int row) {
@@ -420,8 +443,10 @@ void add_blocked(const Job &job, const Visibility &v, const Ray &ray, int k, int
         stop = start + 1;
         continue;
       }
-      for (stop = start + 1; stop < columns && crosses[stop] && std::abs(column[stop] - column[start]) < LONGEST - 2 * BLOCK; stop++) {}
-      const int low = std::min(column[start], column[stop - 1]), high = std::min(std::max(column[start], column[stop - 1]) + 1, W - 1);
+      for (stop = start + 1;
+           stop < columns && crosses[stop] && std::abs(column[stop] - column[start]) < LONGEST - 2 * BLOCK; stop++) {}
+      const int low = std::min(column[start], column[stop - 1]),
+                high = std::min(std::max(column[start], column[stop - 1]) + 1, W - 1);
       const int first = low / BLOCK;
       meets[row % 2] |= cover_row(job, row, first, high / BLOCK - first + 1, place, light, covered);
       for (int i = start; i < stop; i++) {
@@ -498,12 +523,12 @@ std::vector<float> gains_of(const Job &job, const RayKernels &kernels) {
 // 2. Let p be a pixel of the patch and q the ray's source: the ray to p crosses a surface of coc c at
 //    q + (p - q) (1 - c / coc of the ray). Sum the coverage there over all nearer bins of coc.
 // 3. Add light * tap * (1 - blocked), with blocked at most 1.
-void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays, int count, const RayKernels &ray_kernels,
-           const std::vector<float> &gains, float *tile) {
+void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays, int count,
+           const RayKernels &ray_kernels, const std::vector<float> &gains, float *tile) {
   const int H = job.height, W = job.width, C = job.channels, E = job.colours;
   std::vector<int> nearer;  // bins of surfaces that may block the ray
   std::vector<const float *> surface_light(C);
-  std::vector<FieldMask> masks;  // one for each colour
+  std::vector<FieldMask> masks;                        // one for each colour
   std::vector<float> taps((size_t)E * PATCH * PATCH);  // [colours, PATCH, PATCH]
   for (int r = 0; r < count; r++) {
     const Ray &ray = job.rays[rays[r]];
@@ -558,7 +583,9 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
             add_taps(ray_kernels, ray, e, py + i - ray.row, px - ray.column, nx, row);
             for (int x = 0; x < nx && gain > 0; x += LANES)
               if (any_positive(load<vec>(row + x)))
-                store(row + x, load<vec>(row + x) * gain * masks[e].transmittance(broadcast((float)(py + i - ray.row)), (float)(px + x - ray.column) + iota()));
+                store(row + x, load<vec>(row + x) * gain *
+                                   masks[e].transmittance(broadcast((float)(py + i - ray.row)),
+                                                          (float)(px + x - ray.column) + iota()));
             for (int x = 0; x < PATCH; x += LANES) any |= any_positive(load<vec>(row + x));
           }
         }

@@ -34,13 +34,14 @@ struct Visibility {
   std::vector<Cell> cells;  // those that a ray may cross
   // Classes that may contain a surface of a bin or of the bin before.
   uint64_t classes_of(int bin) const {
-    const int first = std::min((int)(std::max(0, bin - 1) / class_width), CLASSES - 1), last = std::min((int)((bin + 1) / class_width), CLASSES - 1);
+    const int first = std::min((int)(std::max(0, bin - 1) / class_width), CLASSES - 1),
+              last = std::min((int)((bin + 1) / class_width), CLASSES - 1);
     return (2ull << last) - (1ull << first);
   }
   // Remainders of a bin and of the bin before, as a cell with a surface of the bin has them.
   static uint64_t remainders_of(int bin) { return 1ull << bin % 64 | 1ull << (bin + 63) % 64; }
-  // Whether a cell may contain a surface of a bin. Classes alone would accept a distant coc of the same class, remainders
-  // alone a coc that is 64 px away.
+  // Whether a cell may contain a surface of a bin. Classes alone would accept a distant coc of the same class,
+  // remainders alone a coc that is 64 px away.
   bool may_show(const Cell &cell, uint64_t classes, uint64_t remainders) const {
     return (cell.classes & classes) != 0 && (cell.remainders & remainders) != 0;
   }

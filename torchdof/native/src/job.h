@@ -27,8 +27,8 @@ struct Job {
   int height, width, channels, colours;  // colours: kernels of each layer, 1 or channels
   std::vector<Layer> layers;
   Surfaces surfaces;
-  std::vector<int32_t> radii;  // of highlight kernels, in steps of 1/32 px
-  std::vector<Ray> rays;       // sorted by surface and position
+  std::vector<int32_t> radii;    // of highlight kernels, in steps of 1/32 px
+  std::vector<Ray> rays;         // sorted by surface and position
   std::vector<float> ray_light;  // [rays, channels]
 
   // light behind all surfaces at every fourth pixel [channels, behind_height, behind_width]; empty if unknown
@@ -42,7 +42,7 @@ struct Job {
 
   Buffer<float> clean_light, clean_coc, validity;  // copies of inputs that had to be changed
   std::vector<Buffer<float>> copies;
-  std::vector<float> light_least, light_most;        // of each channel
+  std::vector<float> light_least, light_most;       // of each channel
   Buffer<float> block_low, block_high, block_peak;  // smallest and largest coc and largest light of each block
 
   template <typename Body>
@@ -52,10 +52,10 @@ struct Job {
 
  private:
   void take_scene();
-  void find_threshold();                  // highlights.cpp
-  void fill_hidden();                     // disocclusion.cpp
-  void add_background();           // matting.cpp
-  void extract_highlights();              // highlights.cpp
+  void find_threshold();      // highlights.cpp
+  void fill_hidden();         // disocclusion.cpp
+  void add_background();      // matting.cpp
+  void extract_highlights();  // highlights.cpp
 };
 
 }  // namespace torchdof

@@ -14,11 +14,11 @@ inline float peak_of(const float *light, size_t step, int channels) {
 }
 
 // Adds the gradient by that peak, which equal channels share.
-inline void add_to_peak(const float *light, size_t step, int channels, float peak, float of_peak, float *of_light) {
+inline void add_to_peak(const float *light, size_t step, int channels, float peak, float d_peak, float *d_light) {
   int peaks = 0;
   for (int c = 0; c < channels; c++) peaks += light[c * step] == peak;
   for (int c = 0; c < channels; c++)
-    if (light[c * step] == peak) of_light[c * step] += of_peak / peaks;
+    if (light[c * step] == peak) d_light[c * step] += d_peak / peaks;
 }
 
 }  // namespace torchdof

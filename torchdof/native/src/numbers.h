@@ -1,5 +1,5 @@
-// Numbers and comparisons with which the rules of the picture are written: for the compiled engine, with vectors of pixels,
-// and for the kernels of GPUs (torchdof/kernels), with single pixels.
+// Numbers and comparisons with which the rules of the picture are written: for the compiled engine, with vectors of
+// pixels, and for the kernels of GPUs (torchdof/kernels), with single pixels.
 #pragma once
 
 namespace torchdof {

@@ -1,5 +1,7 @@
 // Circles of confusion of a frame, and the positions of its layers on the blur axis; formulas in optics/camera.py,
 // render/layers/layer_cocs.py and render/layers/plan.py.
+#include "constants/plan.h"
+
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -11,7 +13,6 @@
 #include "api.h"
 #include "blur_axis.h"
 #include "constants/layer_cocs.h"
-#include "constants/plan.h"
 #include "entry.h"
 #include "extremes.h"
 #include "simd.h"
@@ -43,13 +44,15 @@ double finest(double x) { return std::max(FINEST, std::fabs(x) / FINEST_PARTS); 
 
 double spacing(double x, double tolerance) {
   const double times = tolerance * 255;
-  const double loose = times <= LOOSE ? std::pow(times, SPACING_POWER) : std::max(std::pow(LOOSE, SPACING_POWER), std::sqrt(times));
+  const double loose =
+      times <= LOOSE ? std::pow(times, SPACING_POWER) : std::max(std::pow(LOOSE, SPACING_POWER), std::sqrt(times));
   return std::max(finest(x), SPACING * loose * std::pow(std::max(std::fabs(x) + (1 - GROWS_FROM_PX), 1.0), GROWTH));
 }
 
 // Positions in units of the finest spacing from focus, and the inverse.
 double in_finest(double x) {
-  const double steps = std::min(std::fabs(x), WIDE) / FINEST + FINEST_PARTS * std::log(std::max(std::fabs(x) / WIDE, 1.0));
+  const double steps =
+      std::min(std::fabs(x), WIDE) / FINEST + FINEST_PARTS * std::log(std::max(std::fabs(x) / WIDE, 1.0));
   return std::copysign(steps, x);
 }
 double from_finest(double steps) {
@@ -93,7 +96,8 @@ vec dioptres_behind(vec z, float s) {
 // Radius above which a kernel is constant within the frame.
 float reach_of(int height, int width) { return WIDEST * std::max(height, width) + WIDEST; }
 
-void coc_of_depth(const float *depth, int64_t count, float scale, float nearest, float farthest, int threads, float *out) {
+void coc_of_depth(const float *depth, int64_t count, float scale, float nearest, float farthest, int threads,
+                  float *out) {
   constexpr int64_t PART = 1 << 15;
   torchdof::parallel(threads, (int)((count + PART - 1) / PART), nullptr, [&](int part, int) {
     const auto coc_at = [&](vec z) {
@@ -133,7 +137,8 @@ double mean_change(const float *coc, int height, int width, int threads) {
   return std::accumulate(changes.begin(), changes.end(), 0.0) / ((double)height * width);
 }
 
-// 1. Fixed nodes: the nearest and the farthest place, and places with much of the border, with a neighbour on each side.
+// 1. Fixed nodes: the nearest and the farthest place, and places with much of the border, with a neighbour on each
+// side.
 // 2. Nodes from the focus outwards, with a spacing that grows with the blur and the tolerance.
 // 3. Nodes close to a fixed one move towards it, so that the nodes change continuously with the scene.
 std::vector<double> plan(const float *coc, int maps, int height, int width, double &tolerance, int threads) {
@@ -148,7 +153,8 @@ std::vector<double> plan(const float *coc, int maps, int height, int width, doub
   auto place = [&](float c) { return axis(std::isnan(c) ? 0.0f : std::clamp(c, -reach, reach), -INFINITY, INFINITY); };
   const double nearest = place(low), farthest = place(high);
   double widest = std::max({-(double)coc_at(nearest), (double)coc_at(farthest), 1.0});  // px
-  if (SMALL_RADII * widest > std::min(height, width)) {  // the mean of the widest pixels, 1 of FEW, so that a single one does not decide
+  if (SMALL_RADII * widest >
+      std::min(height, width)) {  // the mean of the widest pixels, 1 of FEW, so that a single one does not decide
     double usual = 1;
     std::vector<float> radii(area);
     const auto most = radii.begin() + (area + FEW - 1) / FEW;
@@ -167,7 +173,8 @@ std::vector<double> plan(const float *coc, int maps, int height, int width, doub
   std::vector<float> border;
   for (const float *map = coc; map < coc + maps * area; map += area) {
     for (int x = 0; x < width; x++) border.insert(border.end(), {place(map[x]), place(map[area - width + x])});
-    for (int y = 0; y < height; y++) border.insert(border.end(), {place(map[(int64_t)y * width]), place(map[(int64_t)(y + 1) * width - 1])});
+    for (int y = 0; y < height; y++)
+      border.insert(border.end(), {place(map[(int64_t)y * width]), place(map[(int64_t)(y + 1) * width - 1])});
   }
   std::vector<double> fixed = {nearest, farthest};
   auto to_fixed = [&](double node) {
@@ -184,7 +191,8 @@ std::vector<double> plan(const float *coc, int maps, int height, int width, doub
   std::vector<double> nodes(fixed);
   if (nearest < 0 && 0 < farthest) nodes.push_back(0);
   for (int sign : {-1, 1})
-    for (double x = spacing(0, tolerance), limit = sign < 0 ? -nearest : farthest; x < limit; x += spacing(x, tolerance)) {
+    for (double x = spacing(0, tolerance), limit = sign < 0 ? -nearest : farthest; x < limit;
+         x += spacing(x, tolerance)) {
       const double node = sign * x;
       if (!(nearest < node && node < farthest)) continue;
       double near = fixed[0];  // a node close to a fixed one moves towards it, or onto it
@@ -200,7 +208,8 @@ std::vector<double> plan(const float *coc, int maps, int height, int width, doub
 
 }  // namespace torchdof
 
-int32_t torchdof_coc(const float *depth, int64_t count, float scale, float nearest, float farthest, int32_t threads, float *out) {
+int32_t torchdof_coc(const float *depth, int64_t count, float scale, float nearest, float farthest, int32_t threads,
+                     float *out) {
   return torchdof::guarded([&] { torchdof::coc_of_depth(depth, count, scale, nearest, farthest, threads, out); });
 }
 

@@ -1,5 +1,5 @@
-// Vectors of LANES pixels, written with the vector types of GCC and Clang: their operators work lane by lane, and a scalar
-// beside a vector is broadcast. Comparisons give an ivec of masks, -1 where they hold; `mask ? a : b` selects.
+// Vectors of LANES pixels, written with the vector types of GCC and Clang: their operators work lane by lane, and a
+// scalar beside a vector is broadcast. Comparisons give an ivec of masks, -1 where they hold; `mask ? a : b` selects.
 #pragma once
 #include <cstdint>
 #include <cstring>

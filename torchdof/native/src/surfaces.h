@@ -11,10 +11,10 @@ namespace torchdof {
 
 // The surfaces of BLOCK x BLOCK pixels where a second one exists or the first differs from the image.
 struct Block {
-  float *own;     // light of the first surface [channels, BLOCK_PIXELS]
-  float *other;   // light of the second surface
-  float *coc;     // of the second surface
-  float *weight;  // of the second surface
+  float *own;         // light of the first surface [channels, BLOCK_PIXELS]
+  float *other;       // light of the second surface
+  float *coc;         // of the second surface
+  float *weight;      // of the second surface
   float *own_weight;  // of the first surface
 };
 
