@@ -198,9 +198,6 @@ class Composite {
   }
 
   // Finds the node before each pixel of each surface, and the layers that occur in each cell of CELL x CELL pixels.
-  //
-  // Fills a block at once if it shows one surface that lies between two neighbouring nodes. In other blocks, compares
-  // the places of a cell's pixels with the nodes between the smallest and the largest one.
   void index() {
     index_.words = (N_ + 63) / 64;
     index_.rows = ceil_div(H_, CELL);
@@ -209,113 +206,136 @@ class Composite {
     index_.single.assign((size_t)index_.rows * index_.columns, 0);
     index_.mixed.assign(index_.single.size(), 0);
     for (int i = 0; i < s_.count; i++) index_.intervals.emplace_back(s_.area());
-    auto node_before = [&](float place) {
-      const auto after = std::upper_bound(layers_.begin() + 1, layers_.end(), place,
-                                          [](float at, const Layer &l) { return at < l.at; });
-      return (int)(after - layers_.begin()) - 1;
-    };
-    auto mark = [&](uint64_t *bits, float place, int k) {
-      bits[k / 64] |= 1ull << k % 64;
-      if (place > layers_[k].at) bits[(k + 1) / 64] |= 1ull << (k + 1) % 64;
-    };
     constexpr int CELLS = BLOCK / CELL;
     job_.parallel(s_.block_rows, [&](int by, int) {
       std::vector<const float *> light(C_);
-      const float *coc, *weight;
       for (int bx = 0; bx < s_.block_columns; bx++) {
-        const int block = by * s_.block_columns + bx, y_end = std::min(H_, (by + 1) * BLOCK),
-                  x_end = std::min(W_, (bx + 1) * BLOCK);
-        if (!s_.full_planes() && !s_.has_block(block)) {  // one surface, usually between two neighbouring nodes
-          const float low = index_.place(job_.block_low[block]), high = index_.place(job_.block_high[block]);
-          const int k = node_before(low);
-          if (k == node_before(high)) {
-            for (int y = by * BLOCK; y < y_end; y++)
-              std::fill(&index_.intervals[0][(size_t)y * W_ + bx * BLOCK],
-                        &index_.intervals[0][(size_t)y * W_ + x_end - 1] + 1, (uint16_t)k);
-            for (int row = by * CELLS; row * CELL < y_end && row < (by + 1) * CELLS; row++)
-              for (int column = bx * CELLS; column * CELL < x_end && column < (bx + 1) * CELLS; column++) {
-                const size_t cell = (size_t)row * index_.columns + column;
-                mark(&index_.bits[cell * index_.words], low, k);
-                mark(&index_.bits[cell * index_.words], high, k);
-                index_.single[cell] = !s_.independent;
-              }
-            continue;
-          }
-        }
-        for (int row = by * CELLS; row * CELL < y_end && row < (by + 1) * CELLS; row++)
-          for (int column = bx * CELLS; column * CELL < x_end && column < (bx + 1) * CELLS; column++) {
-            const size_t cell = (size_t)row * index_.columns + column;
-            uint64_t *bits = &index_.bits[cell * index_.words];
-            const int x0 = column * CELL, n = std::min(CELL, W_ - x0), rows = std::min(CELL, H_ - row * CELL);
-            float own_cocs[CELL * CELL], own_weights[CELL * CELL];
-            bool single = true;
-            for (int i = 0; i < s_.count; i++) {
-              // places: of all pixels; shown: of pixels with weight. A row cut off by the frame repeats its last pixel.
-              float places[CELL * CELL], shown[CELL * CELL], cut_coc[CELL], cut_weight[CELL];
-              vec lows = broadcast(NEVER), highs = broadcast(-NEVER), least_weight = broadcast(1.0f), most_weight = {},
-                  farther_weight = {};
-              bool there = true;
-              for (int y = 0; y < rows; y++) {
-                if (!(there = s_.row(i, row * CELL + y, x0, light.data(), coc, weight))) break;
-                for (int x = 0; n < CELL && x < CELL; x++) {
-                  cut_coc[x] = coc[std::min(x, n - 1)];
-                  if (weight) cut_weight[x] = weight[std::min(x, n - 1)];
-                }
-                if (n < CELL) coc = cut_coc, weight = weight ? cut_weight : nullptr;
-                for (int x = 0; x < CELL; x += LANES) {
-                  const vec its_coc = load<vec>(coc + x), place = index_.place(its_coc),
-                            w = weight ? load<vec>(weight + x) : broadcast(1.0f);
-                  const auto weighs = w != vec{};
-                  store(places + y * CELL + x, place);
-                  store(shown + y * CELL + x, weighs ? place : broadcast(NEVER));
-                  lows = min(lows, weighs ? place : broadcast(NEVER));
-                  highs = max(highs, weighs ? place : broadcast(-NEVER));
-                  least_weight = min(least_weight, w);
-                  most_weight = max(most_weight, w);
-                  float *const own_coc = own_cocs + y * CELL + x, *const own_weight = own_weights + y * CELL + x;
-                  if (i) farther_weight = max(farther_weight, its_coc < load<vec>(own_coc) ? load<vec>(own_weight) : w);
-                  if (!i) store(own_coc, its_coc), store(own_weight, w);
-                }
-              }
-              if (!there) continue;
-              single &= i ? !any_positive(most_weight) : reduce_min(least_weight) >= 1;
-              if (i) index_.mixed[cell] = reduce_max(farther_weight) > HIDDEN_WEIGHT;
-              uint16_t *intervals = &index_.intervals[i][(size_t)row * CELL * W_ + x0];
-              const bool any = any_positive(most_weight);
-              const int first = any ? node_before(reduce_min(lows)) : 0,
-                        last = any ? node_before(reduce_max(highs)) : 0;
-              if (first == last) {
-                for (int y = 0; y < rows; y++)
-                  std::fill(intervals + (size_t)y * W_, intervals + (size_t)y * W_ + n, (uint16_t)first);
-                if (any) mark(bits, reduce_min(lows), first), mark(bits, reduce_max(highs), first);
-                continue;
-              }
-              for (int y = 0; y < rows; y++) {
-                int32_t nodes[CELL];
-                for (int x = 0; x < CELL; x += LANES) {
-                  const vec place = load<vec>(places + y * CELL + x);
-                  ivec node = ivec{} + first;
-                  for (int k = first + 1; k <= last; k++) node -= place >= broadcast(layers_[k].at);
-                  store(nodes + x, node);
-                }
-                for (int x = 0; x < n; x++) intervals[(size_t)y * W_ + x] = (uint16_t)nodes[x];
-              }
-              for (int k = first; k <= std::min(last + 1, N_ - 1);
-                   k++) {  // layer k occurs between nodes k - 1 and k + 1
-                const vec before = broadcast(k == first ? -NEVER : layers_[k - 1].at),
-                          after = broadcast(k > last || k == N_ - 1 ? NEVER : layers_[k + 1].at);
-                ivec found = {};
-                for (int j = 0; j < rows * CELL; j += LANES) {
-                  const vec place = load<vec>(shown + j);
-                  found |= (place > before) & (place < after);
-                }
-                if (any_of(found)) bits[k / 64] |= 1ull << k % 64;
-              }
-            }
-            index_.single[cell] = single && !s_.independent;
-          }
+        if (index_at_once(by, bx)) continue;
+        for (int row = by * CELLS; row < std::min((by + 1) * CELLS, index_.rows); row++)
+          for (int column = bx * CELLS; column < std::min((bx + 1) * CELLS, index_.columns); column++)
+            index_cell(row, column, light.data());
       }
     });
+  }
+
+  int node_before(float place) const {
+    const auto is_before = [](float at, const Layer &l) { return at < l.at; };
+    const auto after = std::upper_bound(layers_.begin() + 1, layers_.end(), place, is_before);
+    return (int)(after - layers_.begin()) - 1;
+  }
+
+  // Marks the layers of a place after node k.
+  void mark_layers(uint64_t *bits, float place, int k) const {
+    bits[k / 64] |= 1ull << k % 64;
+    if (place > layers_[k].at) bits[(k + 1) / 64] |= 1ull << (k + 1) % 64;
+  }
+
+  // Indexes a block at once if it shows one surface that lies between two neighbouring nodes, as it usually does; else
+  // returns false.
+  bool index_at_once(int by, int bx) {
+    constexpr int CELLS = BLOCK / CELL;
+    const int block = by * s_.block_columns + bx;
+    if (s_.full_planes() || s_.has_block(block)) return false;
+    const float low = index_.place(job_.block_low[block]), high = index_.place(job_.block_high[block]);
+    const int k = node_before(low), columns = std::min(BLOCK, W_ - bx * BLOCK);
+    if (k != node_before(high)) return false;
+    for (int y = by * BLOCK; y < std::min(H_, (by + 1) * BLOCK); y++)
+      std::fill_n(&index_.intervals[0][(size_t)y * W_ + bx * BLOCK], columns, (uint16_t)k);
+    for (int row = by * CELLS; row < std::min((by + 1) * CELLS, index_.rows); row++)
+      for (int column = bx * CELLS; column < std::min((bx + 1) * CELLS, index_.columns); column++) {
+        const size_t cell = (size_t)row * index_.columns + column;
+        mark_layers(&index_.bits[cell * index_.words], low, k);
+        mark_layers(&index_.bits[cell * index_.words], high, k);
+        index_.single[cell] = !s_.independent;
+      }
+    return true;
+  }
+
+  // The places of a cell's pixels. A row cut off by the frame repeats its last pixel.
+  struct CellPlaces {
+    float all[CELL * CELL], shown[CELL * CELL];                // shown: of pixels with weight, else NEVER
+    float own_cocs[CELL * CELL], own_weights[CELL * CELL];     // of the first surface
+    vec low, high, least_weight, most_weight, farther_weight;  // farther_weight: largest of the farther of two surfaces
+  };
+
+  void index_cell(int row, int column, const float **light) {
+    const size_t cell = (size_t)row * index_.columns + column;
+    CellPlaces p;
+    bool single = true;
+    for (int i = 0; i < s_.count; i++) {
+      if (!read_places(row, column, i, light, p)) continue;
+      single &= i ? !any_positive(p.most_weight) : reduce_min(p.least_weight) >= 1;
+      if (i) index_.mixed[cell] = reduce_max(p.farther_weight) > HIDDEN_WEIGHT;
+      index_surface(row, column, i, p);
+    }
+    index_.single[cell] = single && !s_.independent;
+  }
+
+  // Returns false if a cell has no surface i.
+  bool read_places(int row, int column, int i, const float **light, CellPlaces &p) const {
+    const int x0 = column * CELL, n = std::min(CELL, W_ - x0), rows = std::min(CELL, H_ - row * CELL);
+    p.low = broadcast(NEVER), p.high = broadcast(-NEVER);
+    p.least_weight = broadcast(1.0f), p.most_weight = p.farther_weight = vec{};
+    for (int y = 0; y < rows; y++) {
+      const float *coc, *weight;
+      float cut_coc[CELL], cut_weight[CELL];
+      if (!s_.row(i, row * CELL + y, x0, light, coc, weight)) return false;
+      for (int x = 0; n < CELL && x < CELL; x++) {
+        cut_coc[x] = coc[std::min(x, n - 1)];
+        if (weight) cut_weight[x] = weight[std::min(x, n - 1)];
+      }
+      if (n < CELL) coc = cut_coc, weight = weight ? cut_weight : nullptr;
+      for (int x = 0; x < CELL; x += LANES) {
+        const vec its_coc = load<vec>(coc + x), place = index_.place(its_coc);
+        const vec w = weight ? load<vec>(weight + x) : broadcast(1.0f);
+        const auto weighs = w != vec{};
+        store(p.all + y * CELL + x, place);
+        store(p.shown + y * CELL + x, weighs ? place : broadcast(NEVER));
+        p.low = min(p.low, weighs ? place : broadcast(NEVER));
+        p.high = max(p.high, weighs ? place : broadcast(-NEVER));
+        p.least_weight = min(p.least_weight, w);
+        p.most_weight = max(p.most_weight, w);
+        float *const own_coc = p.own_cocs + y * CELL + x, *const own_weight = p.own_weights + y * CELL + x;
+        if (i) p.farther_weight = max(p.farther_weight, its_coc < load<vec>(own_coc) ? load<vec>(own_weight) : w);
+        if (!i) store(own_coc, its_coc), store(own_weight, w);
+      }
+    }
+    return true;
+  }
+
+  // Writes the node before each pixel of surface i in a cell, and marks the layers in which it occurs: compares the
+  // places with the nodes between the smallest and the largest one.
+  void index_surface(int row, int column, int i, const CellPlaces &p) {
+    const int x0 = column * CELL, n = std::min(CELL, W_ - x0), rows = std::min(CELL, H_ - row * CELL);
+    uint64_t *const bits = &index_.bits[((size_t)row * index_.columns + column) * index_.words];
+    uint16_t *const intervals = &index_.intervals[i][(size_t)row * CELL * W_ + x0];
+    const bool any = any_positive(p.most_weight);
+    const int first = any ? node_before(reduce_min(p.low)) : 0, last = any ? node_before(reduce_max(p.high)) : 0;
+    if (first == last) {
+      for (int y = 0; y < rows; y++) std::fill_n(intervals + (size_t)y * W_, n, (uint16_t)first);
+      if (any) mark_layers(bits, reduce_min(p.low), first), mark_layers(bits, reduce_max(p.high), first);
+      return;
+    }
+    for (int y = 0; y < rows; y++) {
+      int32_t nodes[CELL];
+      for (int x = 0; x < CELL; x += LANES) {
+        const vec place = load<vec>(p.all + y * CELL + x);
+        ivec node = ivec{} + first;
+        for (int k = first + 1; k <= last; k++) node -= place >= broadcast(layers_[k].at);
+        store(nodes + x, node);
+      }
+      for (int x = 0; x < n; x++) intervals[(size_t)y * W_ + x] = (uint16_t)nodes[x];
+    }
+    for (int k = first; k <= std::min(last + 1, N_ - 1); k++) {  // layer k occurs between nodes k - 1 and k + 1
+      const vec before = broadcast(k == first ? -NEVER : layers_[k - 1].at);
+      const vec after = broadcast(k > last || k == N_ - 1 ? NEVER : layers_[k + 1].at);
+      ivec found = {};
+      for (int j = 0; j < rows * CELL; j += LANES) {
+        const vec place = load<vec>(p.shown + j);
+        found |= (place > before) & (place < after);
+      }
+      if (any_of(found)) bits[k / 64] |= 1ull << k % 64;
+    }
   }
 
   // Collects the layers of a range of cells; returns whether these show the first surface alone.

@@ -366,82 +366,31 @@ class Filling {
   // Steps 3 and 4 of `run`. The levels from FINE_LEVELS up are combined once for each cell of BEHIND_STEP pixels, and
   // read like one level by the pixels.
   void fill() {
-    const int levels = job_.levels, H = job_.height, W = job_.width, C = C_;
-    const int rows = area_height_ / BEHIND_STEP, columns = area_width_ / BEHIND_STEP,
-              coarse = std::max(levels - FINE_LEVELS, 0);
-    const int first_y = first_pixel(H, rows, BEHIND_STEP), first_x = first_pixel(W, columns, BEHIND_STEP);
+    const int levels = job_.levels, H = job_.height, W = job_.width;
+    const int rows = area_height_ / BEHIND_STEP, columns = area_width_ / BEHIND_STEP;
+    const int fine = std::min(levels, FINE_LEVELS), reads = fine + (levels > fine);
     job_.behind_height = rows;
     job_.behind_width = columns;
-    job_.behind.resize((size_t)C * rows * columns + 8);  // padding: eight values are read from any position
-    Level combined;                                      // mean of the coarse levels behind cells of BEHIND_STEP pixels
-    combined.height = rows;
-    combined.width = columns;
-    combined.step = BEHIND_STEP;
-    combined.stride = stride_;
-    combined.channels = C;
+    job_.behind.resize((size_t)C_ * rows * columns + 8);  // padding: eight values are read from any position
+    Level combined = {rows, columns, BEHIND_STEP, stride_, C_,
+                      0,    0,       {},          0,       0};  // mean of the coarse levels behind cells
     centre(combined);
-    combined.vote = 0;
-    if (coarse) {
+    if (levels > fine) {
       combined.least_px = pyramid_[FINE_LEVELS].least_px;
       combined.values = Buffer<float>((size_t)rows * columns * stride_);
     }
+    const float first_y = 0.5f * (H - 1) - 0.5f * (rows - 1) * BEHIND_STEP;
+    const float first_x = 0.5f * (W - 1) - 0.5f * (columns - 1) * BEHIND_STEP;
     std::vector<std::vector<Place>> ys, xs;  // positions of the cells in each level
     for (const Level &l : pyramid_) {
-      ys.push_back(
-          places(0.5f * (H - 1) - 0.5f * (rows - 1) * BEHIND_STEP, BEHIND_STEP, rows, l.height, &Level::place_y, l));
-      xs.push_back(places(0.5f * (W - 1) - 0.5f * (columns - 1) * BEHIND_STEP, BEHIND_STEP, columns, l.width,
-                          &Level::place_x, l));
+      ys.push_back(places(first_y, BEHIND_STEP, rows, l.height, &Level::place_y, l));
+      xs.push_back(places(first_x, BEHIND_STEP, columns, l.width, &Level::place_x, l));
     }
-    const Level &base = pyramid_[std::min(levels, FINE_LEVELS) - 1];
-    std::vector<float> mean(C, 0.0f);  // mean light, for cells without valid pixels
-    if (s_.valid) {
-      std::vector<double> sums(C + 1, 0.0);
-      for (int row = 0; row < rows; row++)
-        for (int column = 0; column < columns; column++) {
-          const float *of = base.at(row, column), weight = of[C + 1];
-          if (!(weight > 0)) continue;
-          for (int c = 0; c < C; c++) sums[c] += (double)weight * of[c];
-          sums[C] += weight;
-        }
-      for (int c = 0; c < C; c++) mean[c] = (float)(sums[c] / std::max(sums[C], 1e-12));
-    }
-    job_.parallel(rows, [&](int row, int) {
-      std::vector<float> mean_behind(stride_);
-      std::vector<Sample> samples(levels, {0, 0, std::vector<f8>(stride_ / F8)});
-      for (int column = 0; column < columns; column++) {
-        const size_t at = (size_t)row * columns + column;
-        const float *light = base.at(row, column);
-        if (!(light[C + 1] > 0)) light = mean.data();
-        float *const coarse_mean = coarse ? combined.at(row, column) : nullptr;
-        if (coarse) memset(coarse_mean, 0, stride_ * sizeof(float));
-        const int top = first_y + row * BEHIND_STEP, left = first_x + column * BEHIND_STEP;
-        const int y0 = std::clamp(top, 0, H - 1), y1 = std::clamp(top + BEHIND_STEP - 1 + H % 2, 0, H - 1);
-        const int x0 = std::clamp(left, 0, W - 1), x1 = std::clamp(left + BEHIND_STEP - 1 + W % 2, 0, W - 1);
-        bool needed = false;
-        for (int r = y0 / cell_; r <= y1 / cell_; r++)
-          for (int c = x0 / cell_; c <= x1 / cell_; c++) needed |= found_[(size_t)r * cell_columns_ + c];
-        if (needed) {
-          needed = false;
-          float near = NEVER;
-          for (int y = y0; y <= y1; y++)
-            for (int x = x0; x <= x1; x++) {
-              near = std::min(near, s_.coc[(size_t)y * W + x]);
-              needed = needed || wanted(y, x);
-            }
-          if (needed) {
-            for (int i = 0; i < levels; i++) samples[i].read(pyramid_[i], ys[i][row], xs[i][column], near);
-            if (coarse)
-              coarse_mean[C + 1] = mix(&pyramid_[FINE_LEVELS], &samples[FINE_LEVELS], coarse, false, coarse_mean);
-            if (mix(pyramid_.data(), samples.data(), levels, true, mean_behind.data()) > 0) light = mean_behind.data();
-          }
-        }
-        for (int c = 0; c < C; c++) job_.behind[(size_t)c * rows * columns + at] = light[c];
-      }
-    });
-    const int fine = std::min(levels, FINE_LEVELS), reads = fine + (coarse > 0);
+    const std::vector<float> mean = mean_light(pyramid_[fine - 1]);
+    job_.parallel(rows, [&](int row, int) { look_behind(row, ys, xs, mean, combined); });
     const Level *read[FINE_LEVELS + 1];  // by pixels: the fine levels, and the coarse ones combined
-    for (int i = 0; i < reads; i++) read[i] = i < fine ? &pyramid_[i] : &combined;
     for (int i = 0; i < reads; i++) {
+      read[i] = i < fine ? &pyramid_[i] : &combined;
       ys[i] = places(0, 1, H, read[i]->height, &Level::place_y, *read[i]);
       xs[i] = places(0, 1, W, read[i]->width, &Level::place_x, *read[i]);
     }
@@ -456,9 +405,71 @@ class Filling {
               found_fine |= fine_[(size_t)r * cell_columns_ + c];
             }
           to.first = found_fine ? 0 : fine;
-          if (found && to.first < reads) C == 3 ? fill_cell<3>(y, x, to) : fill_cell<0>(y, x, to);
+          if (found && to.first < reads) C_ == 3 ? fill_cell<3>(y, x, to) : fill_cell<0>(y, x, to);
         }
     });
+  }
+
+  // Mean light of a level, for cells without valid pixels; 0 if all pixels are valid.
+  std::vector<float> mean_light(const Level &level) const {
+    std::vector<float> mean(C_, 0.0f);
+    if (!s_.valid) return mean;
+    std::vector<double> sums(C_ + 1, 0.0);
+    for (int row = 0; row < level.height; row++)
+      for (int column = 0; column < level.width; column++) {
+        const float *sample = level.at(row, column), weight = sample[C_ + 1];
+        if (!(weight > 0)) continue;
+        for (int c = 0; c < C_; c++) sums[c] += (double)weight * sample[c];
+        sums[C_] += weight;
+      }
+    for (int c = 0; c < C_; c++) mean[c] = (float)(sums[c] / std::max(sums[C_], 1e-12));
+    return mean;
+  }
+
+  // A row of cells of BEHIND_STEP pixels: the light behind them, and the mean of the coarse levels in `combined`. ys,
+  // xs: positions of the cells in each level; mean: light of cells without valid pixels.
+  void look_behind(int row, const std::vector<std::vector<Place>> &ys, const std::vector<std::vector<Place>> &xs,
+                   const std::vector<float> &mean, const Level &combined) {
+    const int levels = job_.levels, C = C_, rows = combined.height, columns = combined.width;
+    const int coarse = std::max(levels - FINE_LEVELS, 0);
+    const Level &base = pyramid_[std::min(levels, FINE_LEVELS) - 1];
+    std::vector<float> mean_behind(stride_);
+    std::vector<Sample> samples(levels, {0, 0, std::vector<f8>(stride_ / F8)});
+    for (int column = 0; column < columns; column++) {
+      const float *light = base.at(row, column);
+      if (!(light[C + 1] > 0)) light = mean.data();
+      float *const coarse_mean = coarse ? combined.at(row, column) : nullptr;
+      if (coarse) memset(coarse_mean, 0, stride_ * sizeof(float));
+      float nearest;
+      if (is_wanted(row, column, rows, columns, nearest)) {
+        for (int i = 0; i < levels; i++) samples[i].read(pyramid_[i], ys[i][row], xs[i][column], nearest);
+        if (coarse) coarse_mean[C + 1] = mix(&pyramid_[FINE_LEVELS], &samples[FINE_LEVELS], coarse, false, coarse_mean);
+        if (mix(pyramid_.data(), samples.data(), levels, true, mean_behind.data()) > 0) light = mean_behind.data();
+      }
+      const size_t at = (size_t)row * columns + column;
+      for (int c = 0; c < C; c++) job_.behind[(size_t)c * rows * columns + at] = light[c];
+    }
+  }
+
+  // Whether a pixel of a cell of BEHIND_STEP pixels may show a hidden surface; nearest: smallest coc of the cell's
+  // pixels.
+  bool is_wanted(int row, int column, int rows, int columns, float &nearest) const {
+    const int H = job_.height, W = job_.width;
+    const int top = first_pixel(H, rows, BEHIND_STEP) + row * BEHIND_STEP;
+    const int left = first_pixel(W, columns, BEHIND_STEP) + column * BEHIND_STEP;
+    const int y0 = std::clamp(top, 0, H - 1), y1 = std::clamp(top + BEHIND_STEP - 1 + H % 2, 0, H - 1);
+    const int x0 = std::clamp(left, 0, W - 1), x1 = std::clamp(left + BEHIND_STEP - 1 + W % 2, 0, W - 1);
+    bool found = false, any = false;
+    for (int r = y0 / cell_; r <= y1 / cell_; r++)
+      for (int c = x0 / cell_; c <= x1 / cell_; c++) found |= found_[(size_t)r * cell_columns_ + c];
+    if (!found) return false;
+    nearest = NEVER;
+    for (int y = y0; y <= y1; y++)
+      for (int x = x0; x <= x1; x++) {
+        nearest = std::min(nearest, s_.coc[(size_t)y * W + x]);
+        any = any || wanted(y, x);
+      }
+    return any;
   }
 
   // The levels that the pixels of a cell read, and the positions of rows and columns in each.
@@ -471,6 +482,32 @@ class Filling {
     std::vector<vec> samples = {};
     std::vector<float> lines = {};  // the same in the level's order
   };
+
+  // Copies the samples of level i around a cell so that the four around each of LANES pixels are vectors; returns the
+  // first row of samples.
+  static int copy_samples(CellLevels &to, int i, int y0, int x0, int rows, int columns, int planes, vec *out) {
+    constexpr int VECTORS = CELL / LANES;
+    const Level &level = *to.levels[i];
+    const Place *ys = &to.ys[i][y0], *xs = &to.xs[i][x0];
+    const int top = ys->before, bottom = std::min(ys[rows - 1].before + 1, level.height - 1), left = xs->before;
+    const int last = std::min(xs[columns - 1].before + 1, level.width - 1) - left;
+    ivec samples[2][VECTORS];
+    for (int x = 0; x < CELL; x++) {
+      const int before = xs[std::min(x, columns - 1)].before - left;
+      samples[0][x / LANES][x % LANES] = before;
+      samples[1][x / LANES][x % LANES] = std::min(before + 1, last);
+    }
+    float *line = to.lines.data();
+    for (int row = top; row <= bottom; row++, line += planes * CELL)
+      for (int x = 0; x <= last; x++)
+        for (int k = 0; k < planes; k++) line[k * CELL + x] = level.at(row, left + x)[k];
+    line = to.lines.data();
+    for (int row = top; row <= bottom; row++, line += planes * CELL)
+      for (int side = 0; side < 2; side++)
+        for (int k = 0; k < planes; k++)
+          for (int v = 0; v < VECTORS; v++) *out++ = lookup(line + k * CELL, samples[side][v]);
+    return top;
+  }
 
   // Fills the second surfaces of a cell: `behind` and `mix` for LANES pixels at once.
   //
@@ -488,28 +525,8 @@ class Filling {
     to.lines.resize(ROWS * planes * CELL);
     vec *const mean = &to.samples[to.count * of_level];
     int first_rows[FINE_LEVELS + 1];
-    for (int i = to.first; i < to.count; i++) {
-      const Level &level = *to.levels[i];
-      const Place *ys = &to.ys[i][y0], *xs = &to.xs[i][x0];
-      const int bottom = std::min(ys[rows - 1].before + 1, level.height - 1), left = xs->before;
-      const int last = std::min(xs[columns - 1].before + 1, level.width - 1) - left;
-      first_rows[i] = ys->before;
-      ivec samples[2][VECTORS];
-      for (int x = 0; x < CELL; x++) {
-        samples[0][x / LANES][x % LANES] = xs[std::min(x, columns - 1)].before - left;
-        samples[1][x / LANES][x % LANES] = std::min(xs[std::min(x, columns - 1)].before - left + 1, last);
-      }
-      float *line = to.lines.data();
-      for (int row = first_rows[i]; row <= bottom; row++, line += planes * CELL)
-        for (int x = 0; x <= last; x++)
-          for (int k = 0; k < planes; k++) line[k * CELL + x] = level.at(row, left + x)[k];
-      vec *out = &to.samples[i * of_level];
-      line = to.lines.data();
-      for (int row = first_rows[i]; row <= bottom; row++, line += planes * CELL)
-        for (int side = 0; side < 2; side++)
-          for (int k = 0; k < planes; k++)
-            for (int v = 0; v < VECTORS; v++) *out++ = lookup(line + k * CELL, samples[side][v]);
-    }
+    for (int i = to.first; i < to.count; i++)
+      first_rows[i] = copy_samples(to, i, y0, x0, rows, columns, planes, &to.samples[i * of_level]);
     for (int y = 0; y < rows; y++) {
       const int within = (y0 + y) % BLOCK * BLOCK + x0 % BLOCK;
       const float *here_of = s_.coc + (size_t)(y0 + y) * W + x0;

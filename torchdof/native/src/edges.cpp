@@ -2,8 +2,6 @@
 //
 // The frame is processed in tiles of AREA x AREA pixels, and within a tile only where the map changes. Each tile is
 // copied with a margin, padded beyond the frame with the nearest border pixel, so that loops run in whole vectors.
-#include "constants/edges.h"
-
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -13,6 +11,7 @@
 #include <vector>
 
 #include "api.h"
+#include "constants/edges.h"
 #include "entry.h"
 #include "memory.h"
 #include "simd.h"
@@ -589,6 +588,23 @@ class Repair {
     return {y0, x0, std::min(part.bottom(), wide.bottom()) - y0, std::min(part.right(), wide.right()) - x0};
   }
 
+  // The maps of a part whose edges are looked for.
+  struct Maps {
+    const bool is_wide;
+    const Part inner, beside, ramps;  // beside: pixels whose ramps affect the inner part; ramps: where a ramp may begin
+    const Grid raw, up, down, slope, jump, high, low, rows, ramp;
+    const Grid nears[RINGS], fars[RINGS], jumps[RINGS];  // near and far surface, and jump, within r + 1 pixels
+
+    Maps(const Part &inner, int halo) : Maps(inner, inner.grown(halo), inner.grown(RINGS), halo == HALO) {}
+
+   private:
+    Maps(const Part &inner, const Part &whole, const Part &beside, bool is_wide)
+        : is_wide(is_wide), inner(inner), beside(beside), ramps(is_wide ? beside.grown(RAMP_REACH) : beside),
+          raw(whole), up(whole), down(whole), slope(whole), jump(whole), high(whole), low(whole), rows(whole),
+          ramp(whole), nears{Grid(beside), Grid(beside), Grid(beside)}, fars{Grid(beside), Grid(beside), Grid(beside)},
+          jumps{Grid(beside), Grid(beside), Grid(beside)} {}
+  };
+
   // Finds the edges of the changing part; returns false if ramps require the larger halo.
   //
   // 1. Slopes that continue on both sides of a pixel are ramp candidates; end_ramps keeps the true ramps.
@@ -597,134 +613,144 @@ class Repair {
   // 4. Each edge pixel gets its kind: ring or level on the ramp, side, and direction of the near surface.
   bool find_in(const Part &own, const Part &inner, int halo, const KindMask &selected, EdgeSums *found,
                std::vector<Edge> &edges) {
-    const bool is_wide = halo == HALO;
-    const Part whole = inner.grown(halo), beside = inner.grown(RINGS),
-               ramps = inner.grown(is_wide ? RINGS + RAMP_REACH : RINGS);
-    const Grid raw(whole), up(whole), down(whole), slope(whole), jump(whole), high(whole), low(whole), rows(whole),
-        ramp(whole);
-    fetch(map_.nearness, raw, [this](float v) { return std::fabs(v) <= LARGEST ? sign_ * v : NAN; });
-    each_vector(whole, [&](int y, int x) {
-      const vec v = load<vec>(raw.at(y, x));
+    const Maps m(inner, halo);
+    fetch(map_.nearness, m.raw, [this](float v) { return std::fabs(v) <= LARGEST ? sign_ * v : NAN; });
+    each_vector(m.raw, [&](int y, int x) {
+      const vec v = load<vec>(m.raw.at(y, x));
       const auto is_valid = abs(v) <= LARGEST;
-      store(up.at(y, x), is_valid ? v : broadcast(-NONE));
-      store(down.at(y, x), is_valid ? -v : broadcast(-NONE));
+      store(m.up.at(y, x), is_valid ? v : broadcast(-NONE));
+      store(m.down.at(y, x), is_valid ? -v : broadcast(-NONE));
     });
-    const auto step_at = [&](int y, int x) {
-      if (!map_.steps) return broadcast(step(0));
-      vec steps;
-      const float *row = map_.steps + (size_t)std::min(std::max(y, 0), height_ - 1) * width_;
-      for (int i = 0; i < LANES; i++) steps[i] = row[std::min(std::max(x + i, 0), width_ - 1)];
-      return max(steps, broadcast(noise_step_));
-    };
-    slopes(raw, slope, jump, is_wide ? ramps.grown(FLAT_REACH + 2) : beside);
-    ramp.clear();
-    // ramps within RINGS pixels affect the inner part
-    const auto any_beside = [&](const auto &is) {
-      vec any{};
-      each_vector(beside, [&](int y, int x) { any = is(y, x) ? broadcast(1.0f) : any; });
-      return any_positive(any);
-    };
-    const auto is_steep = [&](int y, int x) { return load<vec>(slope.at(y, x)) > 0.1f * step_at(y, x); };
-    const auto is_ramp = [&](int y, int x) { return load<vec>(ramp.at(y, x)) > vec{}; };
-    if (any_beside(is_steep)) {
-      max_filter<REACH>(up, high, rows, ramps);
-      max_filter<REACH>(down, low, rows, ramps);
-      each_vector(ramps, [&](int y, int x) {
-        const vec span = load<vec>(high.at(y, x)) + load<vec>(low.at(y, x));
-        const auto is_candidate = is_steep(y, x) & (load<vec>(slope.at(y, x)) > SHALLOW * span) &
-                                  (span > step_at(y, x)) & (abs(load<vec>(raw.at(y, x))) <= LARGEST);
-        store(ramp.at(y, x), is_candidate ? broadcast(1.0f) : vec{});
-      });
-    }
-    if (any_beside(is_ramp)) {
-      if (!is_wide) return false;
-      end_ramps(up, down, slope, high, low, rows, ramp, ramps);
-      each_vector(beside, [&](int y, int x) {
-        const vec near = load<vec>(high.at(y, x)), far = load<vec>(low.at(y, x));
-        const auto is_kept = is_ramp(y, x) & (near + far > step_at(y, x));
-        store(ramp.at(y, x), is_kept ? broadcast(1.0f) : vec{});
-        store(up.at(y, x), is_kept ? near : load<vec>(up.at(y, x)));
-        store(down.at(y, x), is_kept ? far : load<vec>(down.at(y, x)));
-      });
-    }
-    // near and far surface within r + 1 pixels
-    const Grid nears[RINGS] = {Grid(beside), Grid(beside), Grid(beside)},
-               fars[RINGS] = {Grid(beside), Grid(beside), Grid(beside)},
-               jumps[RINGS] = {Grid(beside), Grid(beside), Grid(beside)};
-    for (int r = 0; r < RINGS; r++) {
-      const Part part = inner.grown(RINGS - 1 - r);
-      max_filter<1>(r ? nears[r - 1] : up, nears[r], rows, part);
-      max_filter<1>(r ? fars[r - 1] : down, fars[r], rows, part);
-      max_filter<1>(r ? jumps[r - 1] : jump, jumps[r], rows, part);
-    }
-    const Part means = inner.grown(2);  // over 5 x 5 pixels; their differences give the direction of the step
-    each_vector(inner.grown(4), [&](int y, int x) {
-      const vec v = load<vec>(raw.at(y, x));
-      store(slope.at(y, x), abs(v) <= FINITE ? v : vec{});
-    });
-    sums<2>(slope, high, rows, means, 1.0f / 25.0f);
-
+    slopes(m.raw, m.slope, m.jump, m.is_wide ? m.ramps.grown(FLAT_REACH + 2) : m.beside);
+    if (!find_ramps(m)) return false;
+    find_surfaces(m);
     float marks_of_row[AREA + LANES];
     for (int y = inner.y0; y < inner.bottom(); y++) {
-      const size_t row = (size_t)y * width_;
-      const bool is_own = y >= own.y0 && y < own.bottom();
-      for (int x = inner.x0, k = 0; x < inner.right(); x += LANES, k += LANES) {
-        const vec s = step_at(y, x), v = load<vec>(raw.at(y, x)), is_ramp = load<vec>(ramp.at(y, x)), none = {},
-                  one = broadcast(1.0f);
-        const auto is_valid = abs(v) <= LARGEST;
-        vec near = load<vec>(nears[RINGS - 1].at(y, x)), far = load<vec>(fars[RINGS - 1].at(y, x)), unsure = {};
-        if (!any_of((near + far > s) | (is_ramp > none))) {  // no step is large enough
-          store(marks_of_row + k, is_valid ? none : broadcast((float)UNSURE * (RINGS + 1)));
-          continue;
-        }
-        const vec least_gap = max(NEAREST * (near + far), s);
-        for (int r = RINGS - 1; r >= 0; r--) {
-          const vec n = load<vec>(nears[r].at(y, x)), f = load<vec>(fars[r].at(y, x)), gap = n + f;
-          const auto is_step = (gap > least_gap) & (load<vec>(jumps[r].at(y, x)) > ABRUPT * gap);
-          near = is_step ? n : near;
-          far = is_step ? f : far;
-          unsure = is_step ? broadcast((float)(RINGS - r)) : unsure;
-        }
-        near = is_ramp > none ? load<vec>(up.at(y, x)) : near;
-        far = is_ramp > none ? -load<vec>(down.at(y, x)) : -far;
-        const auto is_edge = (is_ramp + unsure > none) & (near - far > s) & is_valid;
-        const vec is_near = 2.0f * v > near + far ? one : none;
-        const vec mark = (is_edge ? broadcast((float)EDGE) : none) + is_near * (float)NEAR + is_ramp * (float)RAMP;
-        store(marks_of_row + k,
-              (is_edge | (is_ramp > none) ? mark : none) +
-                  (float)UNSURE * (is_valid & (is_ramp <= none) ? unsure : broadcast((float)(RINGS + 1))));
-        const int first = std::max(0, own.x0 - x), last = std::min(LANES, std::min(inner.right(), own.right()) - x);
-        int edges_here = is_own && first < last ? movemask(is_edge) & ((1 << last) - (1 << first)) : 0;
-        if (!edges_here) continue;
-        const vec gap = max(near - far, broadcast(1e-12f)), level = (v - far) / gap;
-        const vec right = load<vec>(high.at(y, x + 2)) - load<vec>(high.at(y, x - 2)),
-                  below = load<vec>(high.at(y + 2, x)) - load<vec>(high.at(y - 2, x));
-        const vec across = abs(right) > abs(below) + TIE * gap ? (right > none ? one : -one) : none;
-        const vec along = abs(below) > abs(right) + TIE * gap ? (below > none ? one : -one) : none;
-        const vec on_ramp =
-            2.0f * RINGS + convert(convert(min(max(level * (float)LEVELS, none), broadcast(LEVELS - 1.0f))));
-        const vec place =
-            is_ramp > none ? on_ramp : (level > 0.5f ? broadcast((float)RINGS) : none) + (float)RINGS - unsure;
-        float nearest[LANES], farthest[LANES];
-        int32_t kinds[LANES], sides[LANES];
-        store(nearest, near);
-        store(farthest, far);
-        const ivec kind = convert(place * (float)DIRECTIONS + 2.0f * along + across + (float)(DIRECTIONS / 2));
-        store(kinds, kind);
-        store(sides, kind + convert(is_near * (float)KINDS));
-        for (; edges_here; edges_here &= edges_here - 1) {
-          const int n = __builtin_ctz(edges_here);
-          if (found)
-            measure(*found, level[n], is_near[n] > 0, climb(raw.at(y, x + n), -1, 1, -raw.pitch, raw.pitch, gap[n]));
-          if (!selected[sides[n]]) continue;
-          edges.push_back({(int)row + x + n, nearest[n], farthest[n], (uint8_t)kinds[n]});
-          marks_of_row[k + n] += (float)LISTED;
-        }
-      }
-      uint8_t *marks = marks_.data() + row + inner.x0;
+      find_in_row(m, own, y, selected, found, edges, marks_of_row);
+      uint8_t *marks = marks_.data() + (size_t)y * width_ + inner.x0;
       for (int k = 0; k < inner.width; k++) marks[k] = (uint8_t)(int)marks_of_row[k];
     }
     return true;
+  }
+
+  // Smallest differences between two surfaces at LANES pixels.
+  vec steps_at(int y, int x) const {
+    if (!map_.steps) return broadcast(step(0));
+    vec steps = {};
+    const float *row = map_.steps + (size_t)std::clamp(y, 0, height_ - 1) * width_;
+    for (int i = 0; i < LANES; i++) steps[i] = row[std::clamp(x + i, 0, width_ - 1)];
+    return max(steps, broadcast(noise_step_));
+  }
+
+  // Marks ramps, and puts the surfaces at their ends into `up` and `down`; returns false if this takes the larger halo.
+  bool find_ramps(const Maps &m) const {
+    m.ramp.clear();
+    // ramps within RINGS pixels affect the inner part
+    const auto any_beside = [&](const auto &is) {
+      vec any{};
+      each_vector(m.beside, [&](int y, int x) { any = is(y, x) ? broadcast(1.0f) : any; });
+      return any_positive(any);
+    };
+    const auto is_steep = [&](int y, int x) { return load<vec>(m.slope.at(y, x)) > 0.1f * steps_at(y, x); };
+    const auto is_ramp = [&](int y, int x) { return load<vec>(m.ramp.at(y, x)) > vec{}; };
+    if (any_beside(is_steep)) {
+      max_filter<REACH>(m.up, m.high, m.rows, m.ramps);
+      max_filter<REACH>(m.down, m.low, m.rows, m.ramps);
+      each_vector(m.ramps, [&](int y, int x) {
+        const vec span = load<vec>(m.high.at(y, x)) + load<vec>(m.low.at(y, x));
+        const auto is_candidate = is_steep(y, x) & (load<vec>(m.slope.at(y, x)) > SHALLOW * span) &
+                                  (span > steps_at(y, x)) & (abs(load<vec>(m.raw.at(y, x))) <= LARGEST);
+        store(m.ramp.at(y, x), is_candidate ? broadcast(1.0f) : vec{});
+      });
+    }
+    if (!any_beside(is_ramp)) return true;
+    if (!m.is_wide) return false;
+    end_ramps(m.up, m.down, m.slope, m.high, m.low, m.rows, m.ramp, m.ramps);
+    each_vector(m.beside, [&](int y, int x) {
+      const vec near = load<vec>(m.high.at(y, x)), far = load<vec>(m.low.at(y, x));
+      const auto is_kept = is_ramp(y, x) & (near + far > steps_at(y, x));
+      store(m.ramp.at(y, x), is_kept ? broadcast(1.0f) : vec{});
+      store(m.up.at(y, x), is_kept ? near : load<vec>(m.up.at(y, x)));
+      store(m.down.at(y, x), is_kept ? far : load<vec>(m.down.at(y, x)));
+    });
+    return true;
+  }
+
+  // Near and far surface within each distance; `high`: means over 5 x 5 pixels, whose differences give the direction of
+  // the step.
+  void find_surfaces(const Maps &m) const {
+    for (int r = 0; r < RINGS; r++) {
+      const Part part = m.inner.grown(RINGS - 1 - r);
+      max_filter<1>(r ? m.nears[r - 1] : m.up, m.nears[r], m.rows, part);
+      max_filter<1>(r ? m.fars[r - 1] : m.down, m.fars[r], m.rows, part);
+      max_filter<1>(r ? m.jumps[r - 1] : m.jump, m.jumps[r], m.rows, part);
+    }
+    each_vector(m.inner.grown(4), [&](int y, int x) {
+      const vec v = load<vec>(m.raw.at(y, x));
+      store(m.slope.at(y, x), abs(v) <= FINITE ? v : vec{});
+    });
+    sums<2>(m.slope, m.high, m.rows, m.inner.grown(2), 1.0f / 25.0f);
+  }
+
+  // Finds the edges in a row: adds the selected ones to `edges`, measures those of the own part, and writes the marks
+  // of the row's pixels.
+  void find_in_row(const Maps &m, const Part &own, int y, const KindMask &selected, EdgeSums *found,
+                   std::vector<Edge> &edges, float *marks) const {
+    const bool is_own = y >= own.y0 && y < own.bottom();
+    const vec none = {}, one = broadcast(1.0f);
+    for (int x = m.inner.x0, k = 0; x < m.inner.right(); x += LANES, k += LANES) {
+      const vec s = steps_at(y, x), v = load<vec>(m.raw.at(y, x)), is_ramp = load<vec>(m.ramp.at(y, x));
+      const auto is_valid = abs(v) <= LARGEST;
+      vec near = load<vec>(m.nears[RINGS - 1].at(y, x)), far = load<vec>(m.fars[RINGS - 1].at(y, x)), unsure = {};
+      if (!any_of((near + far > s) | (is_ramp > none))) {  // no step is large enough
+        store(marks + k, is_valid ? none : broadcast((float)UNSURE * (RINGS + 1)));
+        continue;
+      }
+      const vec least_gap = max(NEAREST * (near + far), s);
+      for (int r = RINGS - 1; r >= 0; r--) {
+        const vec n = load<vec>(m.nears[r].at(y, x)), f = load<vec>(m.fars[r].at(y, x)), gap = n + f;
+        const auto is_step = (gap > least_gap) & (load<vec>(m.jumps[r].at(y, x)) > ABRUPT * gap);
+        near = is_step ? n : near;
+        far = is_step ? f : far;
+        unsure = is_step ? broadcast((float)(RINGS - r)) : unsure;
+      }
+      near = is_ramp > none ? load<vec>(m.up.at(y, x)) : near;
+      far = is_ramp > none ? -load<vec>(m.down.at(y, x)) : -far;
+      const auto is_edge = (is_ramp + unsure > none) & (near - far > s) & is_valid;
+      const vec is_near = 2.0f * v > near + far ? one : none;
+      const vec mark = (is_edge ? broadcast((float)EDGE) : none) + is_near * (float)NEAR + is_ramp * (float)RAMP;
+      const vec reference = is_valid & (is_ramp <= none) ? unsure : broadcast((float)(RINGS + 1));
+      store(marks + k, (is_edge | (is_ramp > none) ? mark : none) + (float)UNSURE * reference);
+      const int first = std::max(0, own.x0 - x), last = std::min(LANES, std::min(m.inner.right(), own.right()) - x);
+      int edges_here = is_own && first < last ? movemask(is_edge) & ((1 << last) - (1 << first)) : 0;
+      if (!edges_here) continue;
+      const vec gap = max(near - far, broadcast(1e-12f)), level = (v - far) / gap;
+      const ivec kind = kinds_at(m, y, x, gap, level, is_ramp, unsure), side = kind + convert(is_near * (float)KINDS);
+      for (; edges_here; edges_here &= edges_here - 1) {
+        const int n = __builtin_ctz(edges_here);
+        if (found) {
+          const float climbed = climb(m.raw.at(y, x + n), -1, 1, -m.raw.pitch, m.raw.pitch, gap[n]);
+          measure(*found, level[n], is_near[n] > 0, climbed);
+        }
+        if (!selected[side[n]]) continue;
+        edges.push_back({y * width_ + x + n, near[n], far[n], (uint8_t)kind[n]});
+        marks[k + n] += (float)LISTED;
+      }
+    }
+  }
+
+  // Kinds of LANES edge pixels. level: nearness, from 0 at the far surface to 1 at the near one; unsure: RINGS less the
+  // ring.
+  static ivec kinds_at(const Maps &m, int y, int x, vec gap, vec level, vec is_ramp, vec unsure) {
+    const vec none = {}, one = broadcast(1.0f);
+    const vec right = load<vec>(m.high.at(y, x + 2)) - load<vec>(m.high.at(y, x - 2));
+    const vec below = load<vec>(m.high.at(y + 2, x)) - load<vec>(m.high.at(y - 2, x));
+    const vec across = abs(right) > abs(below) + TIE * gap ? (right > none ? one : -one) : none;
+    const vec along = abs(below) > abs(right) + TIE * gap ? (below > none ? one : -one) : none;
+    const ivec of_level = convert(min(max(level * (float)LEVELS, none), broadcast(LEVELS - 1.0f)));
+    const vec on_step = (level > 0.5f ? broadcast((float)RINGS) : none) + (float)RINGS - unsure;
+    const vec place = is_ramp > none ? 2.0f * RINGS + convert(of_level) : on_step;
+    return convert(place * (float)DIRECTIONS + 2.0f * along + across + (float)(DIRECTIONS / 2));
   }
 
   // Adds an edge pixel to the statistics.
@@ -825,6 +851,46 @@ class Repair {
     return clamp01((std::fabs(edge.near) - std::fabs(edge.far)) / MORE_BLURRED_PX);
   }
 
+  // A window around a pixel: weights of both surfaces, nearness, and squared differences to the pixel's colour.
+  struct Window {
+    vec weights[2][WINDOW], values[WINDOW], apart[WINDOW];
+  };
+  struct Windows {
+    explicit Windows(int count) : values(count * LANES) {}
+    Window of_pixel[LANES];
+    std::vector<float> values;  // of LANES pixels each: totals of both surfaces, and the pixels' own colours
+  };
+
+  // Likelihoods and surfaces of the pixels of some windows, and how alike the pixels around each one are.
+  struct Likelihoods {
+    float likely[2][LANES], surfaces[2][LANES], blurs[LANES];
+    Likelihoods(const Edge *edges, int pixels, const Windows &windows, vec per_spread, bool wants_surfaces,
+                float *around) {
+      for (int l = 0; l < pixels; l++) {
+        const Window &window = windows.of_pixel[l];
+        const float *apart_at = (const float *)window.apart + REACH * WHOLE + REACH;
+        for (int n = 0; n < 8; n++) around[n * LANES + l] = apart_at[NEIGHBOURS[n][0] * WHOLE + NEIGHBOURS[n][1]];
+        vec parts[6] = {};  // of both surfaces: likelihood, weights, weighted nearness
+        for (int n = 0; n < WINDOW; n++) {
+          const vec t = 1.0f + window.apart[n] * per_spread[l], alike = 1.0f / (t * t);
+          for (int side = 0; side < 2; side++) {
+            parts[side] += window.weights[side][n] * alike;
+            if (!wants_surfaces) continue;
+            const vec part = window.weights[side][n] * (alike + 1e-3f);
+            parts[2 + side] += part;
+            parts[4 + side] += part * window.values[n];
+          }
+        }
+        blurs[l] = more_blurred(edges[l]);
+        for (int side = 0; side < 2; side++) {
+          likely[side][l] = reduce_add(parts[side]);
+          surfaces[side][l] =
+              edges[l].near + reduce_add(parts[4 + side]) / std::max(reduce_add(parts[2 + side]), 1e-12f);
+        }
+      }
+    }
+  };
+
   // C: channels, or 0 for any number.
   //
   // The reference colours of a surface are those of the window's pixels whose nearness is within a quarter of the gap.
@@ -848,21 +914,17 @@ class Repair {
     float *sure = witness.at(around.y0, around.x0);
     for (size_t i = 0; i < witness.size; i += LANES) store(sure + i, lookup(SURE_OF, convert(load<vec>(sure + i))));
     std::vector<vec> many(C ? 0 : count);
-    std::vector<float> of_lanes((count + channels) * LANES);  // of LANES pixels: totals, own colours
-    struct Window {
-      vec weights[2][WINDOW], values[WINDOW], apart[WINDOW];
-    } windows[LANES];
-    const vec none = {}, one = broadcast(1.0f);
-    const auto of = [&](int n) { return load<vec>(&of_lanes[n * LANES]); };
+    Windows windows(count + channels);
+    const vec none = {};
     each_edge(group, [&](size_t k, const Edge &edge, int y, int x) {
       const int lane = (int)(k % LANES);
-      Window &window = windows[lane];
+      Window &window = windows.of_pixel[lane];
       const float near = edge.near, far = edge.far;
       const vec most_difference = broadcast(0.25f * std::max(near - far, 1e-12f));
       vec few[C ? 4 + 2 * C : 1];
       // of both surfaces: weights, squared colour differences, colour differences of each channel
       vec *sums = C ? few : many.data();
-      float *own = &of_lanes[count * LANES + lane];
+      float *own = &windows.values[count * LANES + lane];
       for (int n = 0; n < count; n++) sums[n] = none;
       const float *given_at = given.at(y - REACH, x - REACH), *witness_at = witness.at(y - REACH, x - REACH),
                   *colour_at = colour.at(y - REACH, x - REACH);
@@ -886,69 +948,54 @@ class Repair {
         window.values[n] = off;
         window.apart[n] = apart;
       });
-      for (int n = 0; n < count; n++) of_lanes[n * LANES + lane] = reduce_add(sums[n]);
-      if (lane < LANES - 1 && k + 1 < group.edges.size()) return;
-
-      // LANES pixels at once
-      const vec per_total[2] = {1.0f / of(0), 1.0f / of(1)};
-      vec square = none, contrast = none, noise = none, from_mean[2] = {none, none}, along = none;
-      for (int c = 0; c < channels; c++) {
-        const vec mine = of(count + c), near_off = of(4 + 2 * c) * per_total[0], far_off = of(5 + 2 * c) * per_total[1],
-                  both = 2.0f * mine + near_off + far_off;
-        square += mine * mine;
-        from_mean[0] += near_off * near_off;
-        from_mean[1] += far_off * far_off;
-        contrast += (near_off - far_off) * (near_off - far_off);
-        along += far_off * (far_off - near_off);  // from the far surface's colour towards the near one's
-        noise += both * both;
-      }
-      vec spread = COLOUR_NOISE * noise + 1e-12f;
-      for (int side = 0; side < 2; side++) spread += 0.5f * max(of(2 + side) * per_total[side] - from_mean[side], none);
-      const vec per_light = 1.0f / (SIMILAR * square + 1e-12f), per_spread = 1.0f / (SPREAD * spread);
-      const auto is_known = (of(0) > 1e-3f) & (of(1) > 1e-3f);  // else the neighbours decide
-      const vec reliability = is_known ? max(contrast / (contrast + 0.5f * spread) - 0.1f, none) / 0.9f : one;
-      const vec share = max(min(along / max(contrast, broadcast(1e-12f)), one), none);
-      const vec unmixed = 1.0f + max(from_mean[1] - share * (2.0f * along - share * contrast), none) / spread;
-      const vec mixed = wants_surfaces && map_.is_coc ? MIXTURE / (unmixed * unmixed) : none;
-      float likely[2][LANES], surfaces[2][LANES], blurs[LANES], *around = group.around[k / LANES].alike[0];
-      for (int l = 0; l <= lane; l++) {
-        const Window &window = windows[l];
-        const Edge &edge = group.edges[k - lane + l];
-        const float *apart_at = (const float *)window.apart + REACH * WHOLE + REACH;
-        for (int n = 0; n < 8; n++) around[n * LANES + l] = apart_at[NEIGHBOURS[n][0] * WHOLE + NEIGHBOURS[n][1]];
-        vec parts[6] = {};  // of both surfaces: likelihood, weights, weighted nearness
-        for (int n = 0; n < WINDOW; n++) {
-          const vec t = 1.0f + window.apart[n] * per_spread[l], alike = 1.0f / (t * t);
-          for (int side = 0; side < 2; side++) {
-            parts[side] += window.weights[side][n] * alike;
-            if (!wants_surfaces) continue;
-            const vec part = window.weights[side][n] * (alike + 1e-3f);
-            parts[2 + side] += part;
-            parts[4 + side] += part * window.values[n];
-          }
-        }
-        blurs[l] = more_blurred(edge);
-        for (int side = 0; side < 2; side++) {
-          likely[side][l] = reduce_add(parts[side]);
-          surfaces[side][l] = edge.near + reduce_add(parts[4 + side]) / std::max(reduce_add(parts[2 + side]), 1e-12f);
-        }
-      }
-      for (int n = 0; n < 8; n++) store(around + n * LANES, 1.0f / (1.0f + load<vec>(around + n * LANES) * per_light));
-      vec likelihood[2];
-      for (int side = 0; side < 2; side++) likelihood[side] = load<vec>(likely[side]) * per_total[side] + 1e-9f;
-      likelihood[0] += mixed * load<vec>(blurs);
-      const vec likeliest = is_known ? min(max(likelihood[0], likelihood[1]) / LIKELY, one) : one;
-      const vec odds = likelihood[0] / likelihood[1],
-                clear = min(min(of(0), of(1)) / (wants_surfaces ? CLEAR : CLEAR_IN_PRIOR), one);
-      for (int l = 0; l <= lane; l++) {
-        const Edge &edge = group.edges[k - lane + l];
-        score_[edge.i] =
-            is_known[l] ? std::clamp(std::log(odds[l]), -8.0f, 8.0f) * (marks_[edge.i] & RAMP ? 1.0f : clear[l]) : 0.0f;
-        evidence_[edge.i] = likeliest[l];
-        group.judged[k - lane + l] = {0.0f, reliability[l], is_known[l] ? surfaces[0][l] : edge.near,
-                                      is_known[l] ? surfaces[1][l] : edge.far};
-      }
+      for (int n = 0; n < count; n++) windows.values[n * LANES + lane] = reduce_add(sums[n]);
+      if (lane == LANES - 1 || k + 1 == group.edges.size())
+        score(group, k - lane, lane + 1, windows, channels, wants_surfaces);
     });
+  }
+
+  // Steps 2 to 5 of `judge` for up to LANES pixels at once, from pixel `first` of a group on.
+  void score(Group &group, size_t first, int pixels, const Windows &windows, int channels, bool wants_surfaces) const {
+    const vec none = {}, one = broadcast(1.0f);
+    const auto of = [&](int n) { return load<vec>(&windows.values[n * LANES]); };
+    const int count = 4 + 2 * channels;
+    const vec per_total[2] = {1.0f / of(0), 1.0f / of(1)};
+    vec square = none, contrast = none, noise = none, from_mean[2] = {none, none}, along = none;
+    for (int c = 0; c < channels; c++) {
+      const vec mine = of(count + c), near_off = of(4 + 2 * c) * per_total[0], far_off = of(5 + 2 * c) * per_total[1],
+                both = 2.0f * mine + near_off + far_off;
+      square += mine * mine;
+      from_mean[0] += near_off * near_off;
+      from_mean[1] += far_off * far_off;
+      contrast += (near_off - far_off) * (near_off - far_off);
+      along += far_off * (far_off - near_off);  // from the far surface's colour towards the near one's
+      noise += both * both;
+    }
+    vec spread = COLOUR_NOISE * noise + 1e-12f;
+    for (int side = 0; side < 2; side++) spread += 0.5f * max(of(2 + side) * per_total[side] - from_mean[side], none);
+    const vec per_light = 1.0f / (SIMILAR * square + 1e-12f), per_spread = 1.0f / (SPREAD * spread);
+    const auto is_known = (of(0) > 1e-3f) & (of(1) > 1e-3f);  // else the neighbours decide
+    const vec reliability = is_known ? max(contrast / (contrast + 0.5f * spread) - 0.1f, none) / 0.9f : one;
+    const vec share = max(min(along / max(contrast, broadcast(1e-12f)), one), none);
+    const vec unmixed = 1.0f + max(from_mean[1] - share * (2.0f * along - share * contrast), none) / spread;
+    const vec mixed = wants_surfaces && map_.is_coc ? MIXTURE / (unmixed * unmixed) : none;
+    float *const around = group.around[first / LANES].alike[0];
+    const Likelihoods found(&group.edges[first], pixels, windows, per_spread, wants_surfaces, around);
+    for (int n = 0; n < 8; n++) store(around + n * LANES, 1.0f / (1.0f + load<vec>(around + n * LANES) * per_light));
+    vec likelihood[2];
+    for (int side = 0; side < 2; side++) likelihood[side] = load<vec>(found.likely[side]) * per_total[side] + 1e-9f;
+    likelihood[0] += mixed * load<vec>(found.blurs);
+    const vec likeliest = is_known ? min(max(likelihood[0], likelihood[1]) / LIKELY, one) : one;
+    const vec odds = likelihood[0] / likelihood[1],
+              clear = min(min(of(0), of(1)) / (wants_surfaces ? CLEAR : CLEAR_IN_PRIOR), one);
+    for (int l = 0; l < pixels; l++) {
+      const Edge &edge = group.edges[first + l];
+      score_[edge.i] =
+          is_known[l] ? std::clamp(std::log(odds[l]), -8.0f, 8.0f) * (marks_[edge.i] & RAMP ? 1.0f : clear[l]) : 0.0f;
+      evidence_[edge.i] = likeliest[l];
+      group.judged[first + l] = {0.0f, reliability[l], is_known[l] ? found.surfaces[0][l] : edge.near,
+                                 is_known[l] ? found.surfaces[1][l] : edge.far};
+    }
   }
 
   // Averages the scores of neighbours of similar colour, and adds their evidence.

@@ -67,10 +67,6 @@ void ends_of(const float *values, int width, int rows, float *low, float *high) 
 }
 
 // Takes the inputs.
-//
-// 1. Replace values that are not finite by 0, in copies, and mark their pixels. Clamp coc to the range of the layers.
-// 2. Find the extremes of coc and light in each block and in the frame; refuse light whose powers would overflow.
-// 3. Copy the blocks with marked pixels, where these get the weight 0.
 void Job::take_scene() {
   surfaces.height = height;
   surfaces.width = width;
@@ -81,8 +77,6 @@ void Job::take_scene() {
   surfaces.blocks.resize((size_t)surfaces.block_rows * surfaces.block_columns);
   surfaces.light = scene.light[0];
   surfaces.coc = scene.coc[0];
-  const size_t area = surfaces.area();
-  const float low = coc_at(layers.front().node), high = coc_at(layers.back().node);
   if (scene.kind == TORCHDOF_STACK) {
     surfaces.count = scene.surfaces;
     surfaces.independent = true;
@@ -93,43 +87,53 @@ void Job::take_scene() {
     }
     return;
   }
-  block_low = Buffer<float>(surfaces.blocks.size());
-  block_high = Buffer<float>(surfaces.blocks.size());
+  clean_inputs();
+  find_extremes();
+  if (surfaces.valid) copy_masked_blocks();
+}
+
+// Replaces values that are not finite by 0, in copies, and marks their pixels. Clamps coc to the range of the layers.
+void Job::clean_inputs() {
+  const size_t area = surfaces.area();
+  const float low = coc_at(layers.front().node), high = coc_at(layers.back().node);
   float nearest, farthest, darkest = 0, brightest = 0;
   find_ends(surfaces.coc, area, scene.threads, &nearest, &farthest);
   if (scene.masked) find_ends(surfaces.light, area * channels, scene.threads, &darkest, &brightest);
-  const bool bad = scene.masked && !(std::isfinite(nearest) && std::isfinite(farthest) && std::isfinite(darkest) &&
-                                     std::isfinite(brightest));
-  if (bad || !(nearest >= low && farthest <= high)) {
-    clean_coc = Buffer<float>(area);
-    clean_light = Buffer<float>(bad ? area * channels : 0);
-    validity = Buffer<float>(bad ? area : 0);
-    parallel(height, [&](int y, int) {
-      for (size_t i = (size_t)y * width; i < (size_t)(y + 1) * width; i++) {
-        bool valid = true;
-        if (bad) {
-          valid = std::isfinite(surfaces.coc[i]);
-          for (int c = 0; c < channels; c++) valid &= std::isfinite(surfaces.light[c * area + i]);
-          for (int c = 0; c < channels; c++) clean_light[c * area + i] = valid ? surfaces.light[c * area + i] : 0.0f;
-          validity[i] = valid;
-        }
-        clean_coc[i] = valid ? std::clamp(surfaces.coc[i], low, high) : 0.0f;
+  const auto is_finite = [](float least, float most) { return std::isfinite(least) && std::isfinite(most); };
+  const bool bad = scene.masked && !(is_finite(nearest, farthest) && is_finite(darkest, brightest));
+  if (!bad && nearest >= low && farthest <= high) return;
+  clean_coc = Buffer<float>(area);
+  clean_light = Buffer<float>(bad ? area * channels : 0);
+  validity = Buffer<float>(bad ? area : 0);
+  parallel(height, [&](int y, int) {
+    for (size_t i = (size_t)y * width; i < (size_t)(y + 1) * width; i++) {
+      bool valid = true;
+      if (bad) {
+        valid = std::isfinite(surfaces.coc[i]);
+        for (int c = 0; c < channels; c++) valid &= std::isfinite(surfaces.light[c * area + i]);
+        for (int c = 0; c < channels; c++) clean_light[c * area + i] = valid ? surfaces.light[c * area + i] : 0.0f;
+        validity[i] = valid;
       }
-    });
-    surfaces.coc = clean_coc.data();
-    if (bad) surfaces.light = clean_light.data(), surfaces.valid = validity.data();
-  }
-  block_peak = Buffer<float>(surfaces.blocks.size());
+      clean_coc[i] = valid ? std::clamp(surfaces.coc[i], low, high) : 0.0f;
+    }
+  });
+  surfaces.coc = clean_coc.data();
+  if (bad) surfaces.light = clean_light.data(), surfaces.valid = validity.data();
+}
+
+// Finds the extremes of coc and light in each block and in the frame; refuses light whose powers would overflow.
+void Job::find_extremes() {
+  const size_t area = surfaces.area();
+  for (auto *extremes : {&block_low, &block_high, &block_peak}) *extremes = Buffer<float>(surfaces.blocks.size());
   std::vector<float> leasts((size_t)channels * surfaces.block_rows, INFINITY), mosts(leasts.size(), -INFINITY);
   parallel(surfaces.block_rows, [&](int by, int) {
-    const size_t first = (size_t)by * surfaces.block_columns;
-    ends_of(surfaces.coc + (size_t)by * BLOCK * width, width, std::min(BLOCK, height - by * BLOCK), &block_low[first],
-            &block_high[first]);
+    const size_t first = (size_t)by * surfaces.block_columns, start = (size_t)by * BLOCK * width;
+    const int rows = std::min(BLOCK, height - by * BLOCK);
+    ends_of(surfaces.coc + start, width, rows, &block_low[first], &block_high[first]);
     float *const peaks = &block_peak[first];
     std::vector<float> lows(surfaces.block_columns), highs(surfaces.block_columns);
     for (int c = 0; c < channels; c++) {
-      ends_of(surfaces.light + c * area + (size_t)by * BLOCK * width, width, std::min(BLOCK, height - by * BLOCK),
-              lows.data(), highs.data());
+      ends_of(surfaces.light + c * area + start, width, rows, lows.data(), highs.data());
       for (int i = 0; i < surfaces.block_columns; i++) peaks[i] = c ? std::max(peaks[i], highs[i]) : highs[i];
       leasts[by * channels + c] = *std::min_element(lows.begin(), lows.end());
       mosts[by * channels + c] = *std::max_element(highs.begin(), highs.end());
@@ -141,18 +145,21 @@ void Job::take_scene() {
     light_least[i % channels] = std::min(light_least[i % channels], leasts[i]);
     light_most[i % channels] = std::max(light_most[i % channels], mosts[i]);
   }
-  constexpr float BRIGHTEST =
-      1 << (std::numeric_limits<float>::max_exponent - constants::exposure::SUMMED) / 4;  // fourth powers are summed
+  // fourth powers are summed
+  constexpr float BRIGHTEST = 1 << (std::numeric_limits<float>::max_exponent - constants::exposure::SUMMED) / 4;
   for (int c = 0; c < channels; c++)
     if (std::max(light_most[c], -light_least[c]) > BRIGHTEST) throw TooBright();
-  if (surfaces.valid)
-    for (int i = 0; i < (int)surfaces.blocks.size(); i++) {
-      bool whole = true;
-      const int y0 = i / surfaces.block_columns * BLOCK, x0 = i % surfaces.block_columns * BLOCK;
-      for (int y = y0; y < std::min(height, y0 + BLOCK); y++)
-        for (int x = x0; x < std::min(width, x0 + BLOCK); x++) whole &= surfaces.valid[(size_t)y * width + x] > 0;
-      if (!whole) surfaces.make_block(i);
-    }
+}
+
+// Copies the blocks with marked pixels, where these get the weight 0.
+void Job::copy_masked_blocks() {
+  for (int i = 0; i < (int)surfaces.blocks.size(); i++) {
+    bool whole = true;
+    const int y0 = i / surfaces.block_columns * BLOCK, x0 = i % surfaces.block_columns * BLOCK;
+    for (int y = y0; y < std::min(height, y0 + BLOCK); y++)
+      for (int x = x0; x < std::min(width, x0 + BLOCK); x++) whole &= surfaces.valid[(size_t)y * width + x] > 0;
+    if (!whole) surfaces.make_block(i);
+  }
 }
 
 void find_ends(const float *values, int64_t count, int threads, float *low, float *high) {

@@ -161,6 +161,66 @@ static float part_sent(const Surfaces &surfaces, int channels, int second, int y
   return cover + continuation(cover) * (stopped * is_dark * is_step);
 }
 
+namespace {
+
+// The bright, blurred, visible pixels of each surface in a row of blocks: adds those of surface i to bands[i * step].
+void find_candidates(const Job &job, int by, float from_px, std::vector<Candidate> *bands, size_t step) {
+  const Surfaces &s = job.surfaces;
+  const int channels = job.channels;
+  std::vector<const float *> light(channels);
+  const float *coc, *weight;
+  for (int bx = 0; bx < s.block_columns; bx++) {
+    const int x0 = bx * BLOCK, n = std::min(BLOCK, s.width - x0), block = by * s.block_columns + bx;
+    const float least_limit = least_threshold(job, by * BLOCK, x0);
+    if (!s.full_planes()) {
+      vec peak = broadcast(job.block_peak[block]);
+      const float *of_block = s.blocks[block];  // light of both surfaces comes first
+      for (int i = 0; of_block && i < 2 * channels * BLOCK_PIXELS; i += LANES)
+        peak = max(peak, load<vec>(of_block + i));
+      if (!any_of(peak > least_limit)) continue;
+    }
+    for (int y = by * BLOCK; y < std::min(s.height, (by + 1) * BLOCK); y++)
+      for (int i = 0; i < s.count; i++) {
+        if (!s.row(i, y, x0, light.data(), coc, weight)) continue;
+        for (int x = 0; x < n; x++) {
+          float brightest = light[0][x];
+          for (int c = 1; c < channels; c++) brightest = std::max(brightest, light[c][x]);
+          const bool is_seen = !weight || weight[x] > HIDDEN_WEIGHT;
+          if (!(brightest > least_limit) || !is_seen || !(std::fabs(coc[x]) > from_px)) continue;
+          const float limit = threshold_at(job, y, x0 + x);
+          if (!(brightest > limit)) continue;
+          float part = weight ? weight[x] : 1.0f;
+          if (!s.full_planes() && s.has_block(block)) part = part_sent(s, channels, i, y, x0 + x, coc[x], limit);
+          bands[i * step].push_back({y, x0 + x, brightest, coc[x], limit, part});
+        }
+      }
+  }
+}
+
+// If the kernels have more taps than the budget, keeps only the brightest pixels, and of these only the light above a
+// common limit. taps: of the kernel of a pixel.
+template <typename Taps>
+void limit_taps(std::vector<Candidate> &all, double budget, const Taps &taps) {
+  double taps_of_all = 0;
+  for (const Candidate &p : all) taps_of_all += taps(p);
+  if (!(taps_of_all > budget)) return;
+  std::vector<Candidate> sorted(all);
+  std::sort(sorted.begin(), sorted.end(), [](const Candidate &a, const Candidate &b) { return a.peak > b.peak; });
+  double least = 0, sum = 0, slope = 0;
+  for (size_t k = 0; k < sorted.size(); k++) {
+    sum += taps(sorted[k]);
+    slope += 0.5 * taps(sorted[k]) / sorted[k].peak;
+    if (sum - (k + 1 < sorted.size() ? sorted[k + 1].peak : 0.0) * slope < budget) continue;
+    least = std::min((sum - budget) / slope, (double)sorted[k].peak);
+    break;
+  }
+  const auto is_dimmer = [&](const Candidate &p) { return !(p.peak > least); };
+  all.erase(std::remove_if(all.begin(), all.end(), is_dimmer), all.end());
+  for (Candidate &p : all) p.limit = std::max(p.limit, (float)least);
+}
+
+}  // namespace
+
 // Moves light above the threshold from the surfaces to rays.
 //
 // 1. Collect the bright, blurred, visible pixels of each surface.
@@ -168,47 +228,13 @@ static float part_sent(const Surfaces &surfaces, int channels, int second, int y
 // 3. Subtract the light from the surface and store it in rays.
 // 4. List the radii for which kernels are needed.
 void Job::extract_highlights() {
-  const size_t area = surfaces.area();
   const float from_px = scene.occlusion ? LEAST_PX : std::max(scene.crisp_px - 1.0f, LEAST_PX);
-  const int count = surfaces.count;
-  std::vector<std::vector<Candidate>> bands((size_t)surfaces.block_rows * count);
-  parallel(surfaces.block_rows, [&](int by, int) {
-    std::vector<const float *> light(channels);
-    const float *coc, *weight;
-    for (int bx = 0; bx < surfaces.block_columns; bx++) {
-      const int x0 = bx * BLOCK, n = std::min(BLOCK, width - x0), block = by * surfaces.block_columns + bx;
-      const float least_limit = least_threshold(*this, by * BLOCK, x0);
-      if (!surfaces.full_planes()) {
-        vec peak = broadcast(block_peak[block]);
-        const float *of_block = surfaces.blocks[block];  // light of both surfaces comes first
-        for (int i = 0; of_block && i < 2 * channels * BLOCK_PIXELS; i += LANES)
-          peak = max(peak, load<vec>(of_block + i));
-        if (!any_of(peak > least_limit)) continue;
-      }
-      for (int y = by * BLOCK; y < std::min(height, (by + 1) * BLOCK); y++) {
-        for (int i = 0; i < count; i++) {
-          if (!surfaces.row(i, y, x0, light.data(), coc, weight)) continue;
-          for (int x = 0; x < n; x++) {
-            float brightest = light[0][x];
-            for (int c = 1; c < channels; c++) brightest = std::max(brightest, light[c][x]);
-            if (!(brightest > least_limit) || (weight && !(weight[x] > HIDDEN_WEIGHT)) ||
-                !(std::fabs(coc[x]) > from_px))
-              continue;
-            const float limit = threshold_at(*this, y, x0 + x);
-            if (!(brightest > limit)) continue;
-            float part = weight ? weight[x] : 1.0f;
-            if (!surfaces.full_planes() && surfaces.has_block(block))
-              part = part_sent(surfaces, channels, i, y, x0 + x, coc[x], limit);
-            bands[(size_t)i * surfaces.block_rows + by].push_back({y, x0 + x, brightest, coc[x], limit, part});
-          }
-        }
-      }
-    }
-  });
-  const bool any =
-      std::any_of(bands.begin(), bands.end(), [](const std::vector<Candidate> &band) { return !band.empty(); });
-  double budget = (double)TAPS_PER_PIXEL * area;
-  if (any && scene.occlusion) {
+  const int count = surfaces.count, band_count = surfaces.block_rows;
+  std::vector<std::vector<Candidate>> bands((size_t)band_count * count);
+  parallel(band_count, [&](int by, int) { find_candidates(*this, by, from_px, &bands[by], band_count); });
+  const auto has_any = [](const std::vector<Candidate> &band) { return !band.empty(); };
+  double budget = (double)TAPS_PER_PIXEL * surfaces.area();
+  if (scene.occlusion && std::any_of(bands.begin(), bands.end(), has_any)) {
     const double crowd = std::max(mean_change(surfaces.coc, height, width, scene.threads) / FREE_CHANGE_PX, 1.0);
     budget /= crowd * scene.reach * scene.reach;
   }
@@ -216,34 +242,15 @@ void Job::extract_highlights() {
   const float *coc, *weight;
   for (int i = 0; i < count; i++) {
     std::vector<Candidate> all;
-    for (int by = 0; by < surfaces.block_rows; by++) {
-      const auto &band = bands[(size_t)i * surfaces.block_rows + by];
+    for (int by = 0; by < band_count; by++) {
+      const auto &band = bands[(size_t)i * band_count + by];
       all.insert(all.end(), band.begin(), band.end());
     }
-    if (all.empty()) continue;
-    auto fades = [&](const Candidate &p) { return std::min(std::fabs(p.coc) - from_px, 1.0f); };
-    auto taps = [&](const Candidate &p) {
+    const auto fades = [&](const Candidate &p) { return std::min(std::fabs(p.coc) - from_px, 1.0f); };
+    limit_taps(all, budget, [&](const Candidate &p) {
       const double side = 2.0 * std::fabs(p.coc) + 1;
       return side * side * std::min(WHOLE * (1.0f - p.limit / p.peak) * fades(p), 1.0f);
-    };
-    double taps_of_all = 0;
-    for (const Candidate &p : all) taps_of_all += taps(p);
-    if (taps_of_all >
-        budget) {  // over budget: keep only the brightest, and of these only the light above a common limit
-      std::vector<Candidate> sorted(all);
-      std::sort(sorted.begin(), sorted.end(), [](const Candidate &a, const Candidate &b) { return a.peak > b.peak; });
-      double least = 0, sum = 0, slope = 0;
-      for (size_t k = 0; k < sorted.size(); k++) {
-        sum += taps(sorted[k]);
-        slope += 0.5 * taps(sorted[k]) / sorted[k].peak;
-        if (sum - (k + 1 < sorted.size() ? sorted[k + 1].peak : 0.0) * slope < budget) continue;
-        least = std::min((sum - budget) / slope, (double)sorted[k].peak);
-        break;
-      }
-      all.erase(std::remove_if(all.begin(), all.end(), [&](const Candidate &p) { return !(p.peak > least); }),
-                all.end());
-      for (Candidate &p : all) p.limit = std::max(p.limit, (float)least);
-    }
+    });
     for (const Candidate &p : all) {
       const float share = (1.0f - p.limit / p.peak) * fades(p);
       const float left = (1.0f - fades(p)) + fades(p) * (p.limit / p.peak);  // 1 - share without cancellation

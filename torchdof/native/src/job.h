@@ -52,6 +52,9 @@ struct Job {
 
  private:
   void take_scene();
+  void clean_inputs();
+  void find_extremes();
+  void copy_masked_blocks();
   void find_threshold();      // highlights.cpp
   void fill_hidden();         // disocclusion.cpp
   void add_background();      // matting.cpp

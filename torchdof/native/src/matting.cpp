@@ -1,27 +1,23 @@
 // Matting: a pixel at a depth edge mixes the light of two surfaces but has the depth of one. Splits it into both, as
-// described in render/surfaces/matting.py and render/surfaces/emitters.py.
-#include "constants/matting.h"
-
+// described in render/surfaces/matting.py.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
-#include <cstdlib>
 #include <cstring>
 #include <memory>
-#include <mutex>
 #include <vector>
 
 #include "api.h"
 #include "blocks.h"
 #include "blur_axis.h"
-#include "constants/emitters.h"
+#include "constants/matting.h"
 #include "constants/pipeline.h"
+#include "emitters.h"
 #include "entry.h"
 #include "extremes.h"
 #include "highlights.h"
 #include "job.h"
 #include "light.h"
-#include "memory.h"
 #include "rules.h"
 #include "simd.h"
 #include "surfaces.h"
@@ -30,7 +26,7 @@
 namespace torchdof {
 namespace {
 
-// Constants of matting.py, emitters.py and pipeline.py in render, which give their meanings, units and effects.
+// Constants of matting.py and pipeline.py in render, which give their meanings, units and effects.
 constexpr float EDGE_PX = constants::matting::EDGE_PX;
 constexpr float UNCLEAN = constants::matting::UNCLEAN;
 constexpr float TRUST = constants::matting::TRUST;
@@ -38,13 +34,7 @@ constexpr float TEXTURE = constants::matting::TEXTURE;
 constexpr float MOST_CLEAN = constants::matting::MOST_CLEAN;
 constexpr float ALIKE = constants::matting::ALIKE;
 constexpr float UNBOUNDED = constants::matting::UNBOUNDED;
-constexpr float DIM = constants::emitters::DIM;
-constexpr float LEAST_PEAK = constants::emitters::LEAST_PEAK;
-constexpr float MOST_WEIGHT = constants::emitters::MOST_WEIGHT;
-constexpr int EMITTER_REACH = constants::emitters::EMITTER_REACH;
-constexpr int TOUCHING = constants::emitters::TOUCHING;
 constexpr float SAME_PX = constants::pipeline::SAME_PX;
-enum Side { IN_FRONT = -1, BEHIND = 1 };  // of an emitter, relative to a surface
 
 // Windows around the pixels of a block
 constexpr int REACH = 1;  // pixels around a mixed pixel that define its two colours
@@ -725,102 +715,6 @@ void back_of_block(const Frame &frame, int by, int bx, Window &w, const float *f
   add_window(slopes.coc, SIDE, MARGIN, d_maps[1]);
 }
 
-// Estimates from the pixels around a highlight on which surface its emitter lies.
-class Around {
- public:
-  // matted: compares the light of each pixel's own surface after matting, not that of the image.
-  Around(const Surfaces &s, int y, int x, const float *falloff, bool matted)
-      : s_(s), falloff_(falloff), matted_(matted) {
-    for (int i = 0, dy = -EMITTER_REACH; dy <= EMITTER_REACH; dy++)
-      for (int dx = -EMITTER_REACH; dx <= EMITTER_REACH; dx++, i++) {
-        at_[i] = (size_t)std::clamp(y + dy, 0, s.height - 1) * s.width + std::clamp(x + dx, 0, s.width - 1);
-        coc_[i] = s.coc[at_[i]];
-        nearest_ = std::min(nearest_, coc_[i]);
-        farthest_ = std::max(farthest_, coc_[i]);
-        if (touches(i)) nearest_touching_ = std::min(nearest_touching_, coc_[i]);
-      }
-  }
-
-  // Confidence, 0 to 1, that the emitter lies on one side of the surface at `coc`. light: of the highlight's pixel;
-  // limit: the highlight threshold; share: minimum light on that side, relative to the surface's brightest pixel.
-  float certainty_beyond(float coc, Side side, float share, float light, float limit) {
-    if (!((side == BEHIND ? farthest_ - coc : coc - nearest_touching_) > 1)) return 0.0f;
-    if (!scale)
-      for (int i = 0; i < COUNT; i++) {
-        scale = std::max(scale, peaks_[i] = peak_of(s_.light + at_[i], s_.area(), s_.channels));
-        if (!matted_) continue;
-        const int row = (int)(at_[i] / s_.width), column = (int)(at_[i] % s_.width), which = s_.block_of(row, column);
-        if (s_.has_block(which))
-          peaks_[i] = peak_of(s_.block(which).own + place_in_block(row, column), BLOCK_PIXELS, s_.channels);
-      }
-    const float own_peak = light / scale, dim_below = 5.0f / std::max(own_peak, 1e-12f);
-    float dim_sum = 0, emitter_peak = 0,
-          same_peak = std::max(LEAST_PEAK * own_peak, 1e-12f);  // a ratio of tiny peaks would depend on rounding
-    for (int i = 0; i < COUNT; i++) {
-      const float counted = s_.valid ? s_.valid[at_[i]] : 1.0f, peak = peaks_[i] / scale, away = side * (coc_[i] - coc);
-      const float same = counted * clamp01(2.0f - std::fabs(away));
-      there_[i] = side == BEHIND || touches(i) ? counted * clamp01(away - 1.0f) : 0.0f;
-      dim_[i] = same * falloff_[i] * clamp01(2.5f - dim_below * peak);
-      dim_sum += dim_[i];
-      emitter_peak = std::max(emitter_peak, there_[i] * peak);
-      same_peak = std::max(same_peak, same * peak);
-    }
-    top = std::max(emitter_peak, same_peak);
-    return clamp01(light / limit - 1.0f) * std::min(10.0f * dim_sum, 1.0f) *
-           clamp01(10.0f * (emitter_peak / same_peak - share));
-  }
-
-  // For the last call of `certainty_beyond`: returns the emitter's coc; surface: light of the surface's darkest pixels.
-  float measure_emitter(float light, std::vector<float> &surface) const {
-    const float own_peak = light / scale, least_dim = DIM * own_peak;
-    float dimmest_sum = 0, lit_sum = 0, lit_coc = 0;
-    surface.assign(s_.channels, 0.0f);
-    for (int i = 0; i < COUNT; i++) {
-      const float peak = peaks_[i] / scale, brightness = std::min(peak * peak, 1e30f);
-      const float dimmest = dim_[i] / std::max(brightness + least_dim * least_dim, 1e-24f),
-                  lit = there_[i] * falloff_[i] * brightness;
-      dimmest_sum += dimmest;
-      for (int c = 0; c < s_.channels; c++) surface[c] += s_.light[c * s_.area() + at_[i]] / scale * dimmest;
-      lit_sum += lit;
-      lit_coc += (coc_[i] - nearest_) * lit;
-    }
-    for (float &colour : surface) colour /= std::max(dimmest_sum, 1e-12f);
-    return nearest_ + lit_coc / std::max(lit_sum, 1e-12f);
-  }
-
- private:
-  static constexpr int ACROSS = 2 * EMITTER_REACH + 1, COUNT = ACROSS * ACROSS;
-  static bool touches(int i) {
-    return std::abs(i / ACROSS - EMITTER_REACH) <= TOUCHING && std::abs(i % ACROSS - EMITTER_REACH) <= TOUCHING;
-  }
-  const Surfaces &s_;
-  const float *falloff_;
-  const bool matted_;
-  size_t at_[COUNT];
-  float coc_[COUNT], peaks_[COUNT], there_[COUNT], dim_[COUNT], nearest_ = NEVER, nearest_touching_ = NEVER,
-                                                                farthest_ = -NEVER;
-
- public:
-  float scale = 0, top = 0;  // scale: largest light around; top: largest light of both surfaces, relative to scale
-};
-
-// The highlight threshold of a pixel, if its light is above it; else 0.
-float limit_of_highlight(const Job &job, int y, int x, float light, float least_limit) {
-  const Surfaces &s = job.surfaces;
-  if (!(light > least_limit) || (s.valid && !(s.valid[(size_t)y * s.width + x] > 0))) return 0.0f;
-  const float limit = threshold_at(job, y, x);
-  return light > limit ? limit : 0.0f;
-}
-
-// The own surface keeps what the other surface does not take.
-void set_weight(const Surfaces &s, const Block &block, size_t at, int within, float weight) {
-  for (int c = 0; c < s.channels; c++)
-    block.own[c * BLOCK_PIXELS + within] =
-        (s.light[c * s.area() + at] - weight * block.other[c * BLOCK_PIXELS + within]) / (1.0f - weight);
-  block.weight[within] = weight;
-  block.own_weight[within] = 1.0f - weight;
-}
-
 // Gives pixels of a block the second surfaces of a matte, by their certainty; see render/surfaces/coverage.py.
 void cover_block(Job &job, int by, int bx) {
   Surfaces &s = job.surfaces;
@@ -841,61 +735,8 @@ void cover_block(Job &job, int by, int bx) {
         other = (kept * other + certainty[at] * part[c * area + at] * s.light[c * area + at]) * per;
       }
       if (both > 0) block.coc[within] = (kept * block.coc[within] + given * coc[at]) * per;
-      set_weight(s, block, at, within, both);
+      s.set_weight(block, at, within, both);
     }
-}
-
-// Assigns the light of a highlight's pixel to the surface of its emitter, in front of the pixel's own surface or
-// behind.
-void attribute_emitter(Job &job, int y, int x, float least_limit, const float *falloff) {
-  Surfaces &s = job.surfaces;
-  const int channels = job.channels;
-  const size_t at = (size_t)y * s.width + x, area = s.area();
-  const float light = peak_of(s.light + at, area, channels), own_coc = s.coc[at];
-  const float limit = limit_of_highlight(job, y, x, light, least_limit);
-  if (!(limit > 0)) return;
-  Around around(s, y, x, falloff, false);
-  const int i = s.block_of(y, x), within = place_in_block(y, x);
-  std::vector<float> surface;
-  for (const Side side : {IN_FRONT, BEHIND}) {
-    float sureness = around.certainty_beyond(own_coc, side, side == IN_FRONT ? 1.0f : 0.5f, light, limit);
-    if (!(sureness > 0)) continue;
-    const Block block = s.make_block(i);
-    const float coc = around.measure_emitter(light, surface), floor = *std::max_element(surface.begin(), surface.end());
-    const float share = std::clamp((light / around.scale - floor) / std::max(around.top - floor, 1e-12f),
-                                   1.0f - MOST_WEIGHT, MOST_WEIGHT);
-    // an emitter seen behind a surface is not in front of it
-    if (side == IN_FRONT) sureness *= 1.0f - around.certainty_beyond(coc, BEHIND, 0.5f, light, limit);
-    const float given = std::max(side == IN_FRONT ? sureness : 2.0f * sureness - 1.0f, 0.0f);
-    const float kept =
-        std::max(side == IN_FRONT ? 1.0f - sureness : 1.0f - 2.0f * sureness, 0.0f) * block.weight[within];
-    const float weight = kept + given * share, per_weight = weight > 0 ? 1.0f / std::max(weight, 1e-12f) : 0.0f;
-    for (int c = 0; c < channels; c++) {
-      const float emitter =
-          std::max(s.light[c * area + at] / around.scale - (1.0f - share) * surface[c], 0.0f) * around.scale;
-      float &other = block.other[c * BLOCK_PIXELS + within];
-      other = (kept * other + given * emitter) * per_weight;
-    }
-    block.coc[within] += given * share * per_weight * (coc - block.coc[within]);
-    set_weight(s, block, at, within, weight);
-  }
-}
-
-// Factor of the other surface's weight in a highlight's pixel, below 1 if the emitter lies on the pixel's own surface:
-// the other surface is dark around the pixel, after light of emitters seen through it was taken from it.
-float weight_left(const Job &job, int y, int x, float least_limit, const float *falloff) {
-  const Surfaces &s = job.surfaces;
-  const int i = s.block_of(y, x), within = place_in_block(y, x);
-  const size_t at = (size_t)y * s.width + x;
-  const float light = peak_of(s.light + at, s.area(), s.channels),
-              limit = limit_of_highlight(job, y, x, light, least_limit);
-  const Block block = s.block(i);
-  if (!(limit > 0) || !(block.weight[within] > 0)) return 1.0f;
-  const float bright = clamp01(peak_of(block.other + within, BLOCK_PIXELS, s.channels) / std::max(limit, TINY) - 1.0f);
-  const float beyond = s.coc[at] - block.coc[within], taken = bright * clamp01(std::fabs(beyond) - 1.0f);
-  if (!(taken > 0)) return 1.0f;
-  Around around(s, y, x, falloff, true);
-  return 1.0f - taken * around.certainty_beyond(block.coc[within], beyond > 0 ? BEHIND : IN_FRONT, 1.0f, light, limit);
 }
 
 std::vector<float> falloff_around(int reach) {
@@ -906,31 +747,6 @@ std::vector<float> falloff_around(int reach) {
 }
 
 }  // namespace
-
-Block Surfaces::make_block(int i) {
-  if (blocks[i]) return block(i);
-  const size_t size = (size_t)(2 * channels + 3) * BLOCK_PIXELS;
-  {
-    std::lock_guard<std::mutex> lock(mutex_);
-    if (!blocks_left_) {
-      memory_.emplace_back(BLOCKS_AT_ONCE * size);
-      blocks_left_ = BLOCKS_AT_ONCE;
-    }
-    blocks[i] = memory_.back().data() + --blocks_left_ * size;
-  }
-  memset(blocks[i], 0, size * sizeof(float));
-  const Block made = block(i);
-  const int y0 = i / block_columns * BLOCK, x0 = i % block_columns * BLOCK;
-  const int rows = std::min(BLOCK, height - y0), columns = std::min(BLOCK, width - x0);
-  for (int y = 0; y < rows; y++) {
-    const size_t from = (size_t)(y0 + y) * width + x0;
-    for (int c = 0; c < channels; c++)
-      memcpy(made.own + c * BLOCK_PIXELS + y * BLOCK, light + c * area() + from, columns * sizeof(float));
-    memcpy(made.coc + y * BLOCK, coc + from, columns * sizeof(float));
-    for (int x = 0; x < columns; x++) made.own_weight[y * BLOCK + x] = valid ? valid[from + x] : 1.0f;
-  }
-  return made;
-}
 
 void Job::split_mixed() {
   const std::vector<float> falloff = falloff_around(REACH), around_emitter = falloff_around(EMITTER_REACH);
@@ -984,7 +800,7 @@ void Job::split_mixed() {
     for (const Left &l : row) {
       const Block block = surfaces.block(surfaces.block_of(l.y, l.x));
       const int within = place_in_block(l.y, l.x);
-      set_weight(surfaces, block, (size_t)l.y * width + l.x, within, l.weight * block.weight[within]);
+      surfaces.set_weight(block, (size_t)l.y * width + l.x, within, l.weight * block.weight[within]);
     }
 }
 

@@ -1,7 +1,5 @@
 // Circles of confusion of a frame, and the positions of its layers on the blur axis; formulas in optics/camera.py,
 // render/layers/layer_cocs.py and render/layers/plan.py.
-#include "constants/plan.h"
-
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -13,6 +11,7 @@
 #include "api.h"
 #include "blur_axis.h"
 #include "constants/layer_cocs.h"
+#include "constants/plan.h"
 #include "entry.h"
 #include "extremes.h"
 #include "simd.h"

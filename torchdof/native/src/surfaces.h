@@ -39,6 +39,8 @@ class Surfaces {
   }
   // Returns a block; creates it from the image if it does not exist yet.
   Block make_block(int i);
+  // Sets the weight of a pixel's second surface; the first one keeps the light that the second does not take.
+  void set_weight(const Block &block, size_t at, int within, float weight) const;
   // Surface i at n pixels of a row from column x, within one block column: pointers to each channel, coc and weight
   // (null means 1). Returns false if there is no such surface.
   bool row(int i, int y, int x, const float **light_of, const float *&coc_of, const float *&weight_of) const {
