@@ -925,6 +925,42 @@ class Composite {
     }
   }
 
+  static constexpr int WIDENED =
+      TILE + 32;  // values of a widened row, which begins half a coarse pixel before the tile
+
+  // Widens a row of a coarser canvas, from column `first` on, to the tile's resolution: to [channels + colours,
+  // WIDENED]. Returns false if it covers nothing.
+  bool widen(const Run &run, int row, int first, float *to) const {
+    const int s = run.scale, inside = std::max(std::min(TILE / s + 1, run.columns - 1 - first), 0);
+    float ramp[16];
+    for (int i = 0; i < 16; i++) ramp[i] = (i % s + 0.5f) / s;
+    vec most_cover = {};
+    for (int c = C_ + E_ - 1; c >= 0; c--) {
+      const float *from = &run.canvas[((size_t)c * run.rows + row) * run.columns + first];
+      if (c >= C_) {
+        for (int i = 0; i <= inside; i += LANES) most_cover = max(most_cover, load<vec>(from + i));
+      } else if (!any_positive(most_cover)) {
+        memset(to, 0, (size_t)(C_ + E_) * WIDENED * sizeof(float));
+        return false;
+      }
+      float *v = to + (size_t)c * WIDENED;
+      if (s == 2)
+        for (int i = 0; i < inside; i++) {
+          const float step = from[i + 1] - from[i];
+          v[2 * i] = from[i] + 0.25f * step;
+          v[2 * i + 1] = from[i] + 0.75f * step;
+        }
+      else
+        for (int i = 0; i < inside; i++)
+          for (int part = 0; part < s; part += 4, v += 4) {
+            typedef float f4 __attribute__((vector_size(16)));
+            const f4 value = f4{} + from[i], step = f4{} + (from[i + 1] - from[i]);
+            store(v, value + step * load<f4>(ramp + part));
+          }
+    }
+    return true;
+  }
+
   // Composites a coarser canvas, interpolated, onto the tile's canvas.
   //
   // 1. Return if no layer of the run reaches the tile.
@@ -938,56 +974,24 @@ class Composite {
     for (int r = y0 / s / PART; r <= r1; r++)
       for (int c = x0 / s / PART; c <= c1; c++) any |= run.used[(size_t)r * run.part_columns + c];
     if (!any) return;
-    const int channels = C_ + E_, count = TILE / s + 1, first = x0 / s, pitch = TILE + 32;
-    std::vector<float> memory((size_t)2 * channels * pitch);
-    float *upper = memory.data(), *lower = upper + channels * pitch;  // two rows, widened to the tile's resolution
+    const int channels = C_ + E_;
+    std::vector<float> memory((size_t)2 * channels * WIDENED);
+    float *upper = memory.data(), *lower = upper + channels * WIDENED;  // two rows, widened to the tile's resolution
     bool upper_covers = false, lower_covers = false;
-    float ramp[16];
-    for (int i = 0; i < 16; i++) ramp[i] = (i % s + 0.5f) / s;
-    auto widen = [&](int row, float *to) {
-      vec most_cover = {};
-      for (int c = channels - 1; c >= 0; c--) {
-        const float *from = &run.canvas[((size_t)c * run.rows + row) * run.columns + first];
-        const int inside = std::max(std::min(count, run.columns - 1 - first), 0);
-        if (c >= C_) {
-          for (int i = 0; i <= inside; i += LANES) most_cover = max(most_cover, load<vec>(from + i));
-        } else if (!any_positive(most_cover)) {
-          memset(to, 0, (size_t)channels * pitch * sizeof(float));
-          return false;
-        }
-        float *v = to + (size_t)c * pitch;
-        if (s == 2)
-          for (int i = 0; i < inside; i++) {
-            const float step = from[i + 1] - from[i];
-            v[2 * i] = from[i] + 0.25f * step;
-            v[2 * i + 1] = from[i] + 0.75f * step;
-          }
-        else
-          for (int i = 0; i < inside; i++)
-            for (int part = 0; part < s; part += 4, v += 4) {
-              typedef float f4 __attribute__((vector_size(16)));
-              const f4 value = f4{} + from[i], step = f4{} + (from[i + 1] - from[i]);
-              store(v, value + step * load<f4>(ramp + part));
-            }
-      }
-      return true;
-    };
     for (int y = 0, known = -2; y < TILE; y++) {
       const float at_y = (y0 + y + 0.5f) / s + 0.5f;
       const int row = std::min((int)at_y, run.rows - 2);
       const float down = at_y - row;
       if (row != known) {
         std::swap(upper, lower);
-        upper_covers = row == known + 1 ? lower_covers : widen(row, upper);
-        lower_covers = widen(row + 1, lower);
+        upper_covers = row == known + 1 ? lower_covers : widen(run, row, x0 / s, upper);
+        lower_covers = widen(run, row + 1, x0 / s, lower);
         known = row;
       }
       if (!upper_covers && !lower_covers) continue;
-      // widened row: the first value lies half a coarse pixel before the tile
       auto value_at = [&](int c, int x) {
-        const vec a = load<vec>(upper + (size_t)c * pitch + s / 2 + x),
-                  b = load<vec>(lower + (size_t)c * pitch + s / 2 + x);
-        return a + down * (b - a);
+        const size_t at = (size_t)c * WIDENED + s / 2 + x;
+        return load<vec>(upper + at) + down * (load<vec>(lower + at) - load<vec>(upper + at));
       };
       for (int c = 0; c < channels; c++) {
         // light, then coverage; each keeps 1 - (coverage of this run) of the tile's value

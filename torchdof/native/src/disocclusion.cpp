@@ -509,6 +509,52 @@ class Filling {
     return top;
   }
 
+  // Mean of the samples behind LANES pixels: vector v of row y of the cell at column x0, with the coc `here`. Returns
+  // the sum of the votes; mean: light and coc.
+  template <int CHANNELS>
+  vec mean_behind(const CellLevels &to, const int *first_rows, vec here, int y, int x0, int v, int columns,
+                  vec *mean) const {
+    constexpr int VECTORS = CELL / LANES, ROWS = CELL / 2 + 2;
+    const int C = CHANNELS ? CHANNELS : C_, planes = C + 2;
+    const size_t beside = (size_t)planes * VECTORS, below = 2 * beside, of_level = ROWS * below;
+    const vec size = max(here, -here);
+    const vec end = end_of_surface(here);
+    vec total = {};
+    for (int k = 0; k <= C; k++) mean[k] = vec{};
+    for (int i = to.first; i < to.count; i++) {
+      const Level &level = *to.levels[i];
+      const Place row = to.ys[i][y], *xs = &to.xs[i][x0];
+      const vec *corners[4];
+      corners[0] = &to.samples[i * of_level + (row.before - first_rows[i]) * below + v];
+      corners[1] = corners[0] + beside;
+      corners[2] = corners[0] + (level.height > 1 ? below : 0);
+      corners[3] = corners[2] + beside;
+      vec right, weight = {}, counts[4];
+      for (int x = 0; x < LANES; x++) right[x] = xs[std::min(v * LANES + x, columns - 1)].part;
+      const vec left = 1.0f - right,
+                shares[4] = {left * (1.0f - row.part), right * (1.0f - row.part), left * row.part, right * row.part};
+      for (int k = 0; k < 4; k++) {
+        const vec farther = is_another_surface(corners[k][C * VECTORS] - end);
+        weight += counts[k] = shares[k] * corners[k][(C + 1) * VECTORS] * farther;
+      }
+      const vec level_weight = is_read(size, level.least_px);
+      const ivec is_seen = (weight > LEAST_SEEN) & (level_weight > vec{});
+      if (!any_of(is_seen)) continue;
+      const vec voted = level.vote > 0 ? level.vote * min(weight * (1.0f / SURE), broadcast(1.0f)) : weight;
+      const vec vote = is_seen ? level_weight * voted : vec{};
+      total += vote;
+      const vec part = vote / max(total, broadcast(LEAST_TOTAL)), each = 1.0f / max(weight, broadcast(LEAST_SEEN));
+      for (vec &count : counts) count *= each;
+      for (int k = 0; k <= C; k++) {
+        const size_t plane = (size_t)k * VECTORS;
+        const vec sample = corners[0][plane] * counts[0] + corners[1][plane] * counts[1] +
+                           corners[2][plane] * counts[2] + corners[3][plane] * counts[3];
+        mean[k] += (sample - mean[k]) * part;
+      }
+    }
+    return total;
+  }
+
   // Fills the second surfaces of a cell: `behind` and `mix` for LANES pixels at once.
   //
   // 1. Copy each level's samples so that the four around each of LANES pixels are vectors.
@@ -520,7 +566,7 @@ class Filling {
     const int C = CHANNELS ? CHANNELS : C_, planes = C + 2, W = job_.width,
               which = y0 / BLOCK * s_.block_columns + x0 / BLOCK;
     const int rows = std::min(CELL, job_.height - y0), columns = std::min(CELL, W - x0);
-    const size_t beside = (size_t)planes * VECTORS, below = 2 * beside, of_level = ROWS * below;
+    const size_t of_level = (size_t)2 * ROWS * planes * VECTORS;
     to.samples.resize(to.count * of_level + planes);
     to.lines.resize(ROWS * planes * CELL);
     vec *const mean = &to.samples[to.count * of_level];
@@ -538,40 +584,7 @@ class Filling {
         if (s_.has_block(which))
           wanted &= load<vec>(s_.block(which).weight + within + v * LANES) < broadcast(0.5f * HIDDEN_WEIGHT);
         if (!any_of(wanted)) continue;
-        const vec end = end_of_surface(here);
-        vec total = {};
-        for (int k = 0; k <= C; k++) mean[k] = vec{};
-        for (int i = to.first; i < to.count; i++) {
-          const Level &level = *to.levels[i];
-          const Place row = to.ys[i][y0 + y], *xs = &to.xs[i][x0];
-          const vec *corners[4];
-          corners[0] = &to.samples[i * of_level + (row.before - first_rows[i]) * below + v];
-          corners[1] = corners[0] + beside;
-          corners[2] = corners[0] + (level.height > 1 ? below : 0);
-          corners[3] = corners[2] + beside;
-          vec right, weight = {}, counts[4];
-          for (int x = 0; x < LANES; x++) right[x] = xs[std::min(v * LANES + x, columns - 1)].part;
-          const vec left = 1.0f - right, shares[4] = {left * (1.0f - row.part), right * (1.0f - row.part),
-                                                      left * row.part, right * row.part};
-          for (int k = 0; k < 4; k++) {
-            const vec farther = is_another_surface(corners[k][C * VECTORS] - end);
-            weight += counts[k] = shares[k] * corners[k][(C + 1) * VECTORS] * farther;
-          }
-          const vec level_weight = is_read(size, level.least_px);
-          const ivec is_seen = (weight > LEAST_SEEN) & (level_weight > vec{});
-          if (!any_of(is_seen)) continue;
-          const vec voted = level.vote > 0 ? level.vote * min(weight * (1.0f / SURE), broadcast(1.0f)) : weight;
-          const vec vote = is_seen ? level_weight * voted : vec{};
-          total += vote;
-          const vec part = vote / max(total, broadcast(LEAST_TOTAL)), each = 1.0f / max(weight, broadcast(LEAST_SEEN));
-          for (vec &count : counts) count *= each;
-          for (int k = 0; k <= C; k++) {
-            const size_t plane = (size_t)k * VECTORS;
-            const vec sample = corners[0][plane] * counts[0] + corners[1][plane] * counts[1] +
-                               corners[2][plane] * counts[2] + corners[3][plane] * counts[3];
-            mean[k] += (sample - mean[k]) * part;
-          }
-        }
+        const vec total = mean_behind<CHANNELS>(to, first_rows, here, y0 + y, x0, v, columns, mean);
         wanted &= total > vec{};
         if (!any_of(wanted)) continue;
         // replaces a second surface to which matting gave a small weight

@@ -318,6 +318,23 @@ static std::vector<int> passing(const Job &job, const RayKernels &kernels, float
   return count;
 }
 
+// The bits of a cell, in lanes.
+struct CellBits {
+  typedef uint64_t wide __attribute__((vector_size(LANES * 8)));
+  wide classes = {}, remainders = {};
+
+  // Adds those of the surfaces shown. high: largest coc of the image.
+  void add(const Visibility &v, float high, vec coc, ivec shown) {
+    const vec place = min(max(coc - v.low, vec{}), broadcast(high - v.low));
+    const auto bit = [&](ivec which) {
+      return __builtin_convertvector(shown, wide) & ((wide{} + 1) << __builtin_convertvector(which, wide));
+    };
+    classes |= bit(min(convert(place * (1.0f / v.class_width)), ivec{} + (v.CLASSES - 1)));
+    // at a bin's border both bins, because rays compute the distance from it with another rounding error
+    for (const float border : {-1 / 16.0f, 1 / 16.0f}) remainders |= bit(convert(max(place + border, vec{})) & 63);
+  }
+};
+
 Visibility find_visibility(const Job &job, const RayKernels &kernels) {
   Visibility v;
   const int H = job.height, W = job.width;
@@ -334,19 +351,6 @@ Visibility find_visibility(const Job &job, const RayKernels &kernels) {
   v.cells.resize((size_t)v.cell_rows * v.cell_columns);
   const std::vector<int> passed = passing(job, kernels, low, v.cell_rows, v.cell_columns);
   const Surfaces &surfaces = job.surfaces;
-  typedef uint64_t wide __attribute__((vector_size(LANES * 8)));
-  struct Bits {
-    wide classes = {}, remainders = {};
-  };
-  auto add_bits = [&](Bits &bits, vec coc, ivec shown) {
-    const vec place = min(max(coc - low, vec{}), broadcast(high - low));
-    auto bit = [&](ivec which) {
-      return __builtin_convertvector(shown, wide) & ((wide{} + 1) << __builtin_convertvector(which, wide));
-    };
-    bits.classes |= bit(min(convert(place * (1.0f / v.class_width)), ivec{} + (v.CLASSES - 1)));
-    // at a bin's border both bins, because rays compute the distance from it with another rounding error
-    for (const float border : {-1 / 16.0f, 1 / 16.0f}) bits.remainders |= bit(convert(max(place + border, vec{})) & 63);
-  };
   job.parallel(v.cell_rows, [&](int row, int) {
     Visibility::Cell *cells = &v.cells[(size_t)row * v.cell_columns];
     std::vector<const float *> light(job.channels);
@@ -358,16 +362,16 @@ Visibility find_visibility(const Job &job, const RayKernels &kernels) {
       // all coc of a block lie within 1 px: its two extremes give its classes
       const float ends[2] = {job.block_low[block], job.block_high[block]};
       const bool flat = !surfaces.full_planes() && ends[1] - ends[0] < 1;
-      Bits bits[BLOCK / CELL];
-      for (Bits &of_cell : bits)
-        for (float coc : ends) add_bits(of_cell, broadcast(coc), ivec{} - flat);
+      CellBits bits[BLOCK / CELL];
+      for (CellBits &of_cell : bits)
+        for (float coc : ends) of_cell.add(v, high, broadcast(coc), ivec{} - flat);
       for (int y = row * CELL; y < std::min(H, (row + 1) * CELL) && !(flat && !surfaces.has_block(block)); y++)
         each_shown(surfaces, y, x, light.data(),
                    [&](bool own, const float *coc, const float *weight, float least_weight) {
                      if (own && flat) return;
                      for (int j = 0; j < BLOCK; j += LANES)
-                       add_bits(bits[j / CELL], load<vec>(coc + j),
-                                weight ? load<vec>(weight + j) > least_weight : ivec{} == 0);
+                       bits[j / CELL].add(v, high, load<vec>(coc + j),
+                                          weight ? load<vec>(weight + j) > least_weight : ivec{} == 0);
                    });
       for (int j = 0; j < n; j += CELL)
         for (int i = 0; i < LANES; i++) {
@@ -524,6 +528,58 @@ std::vector<float> gains_of(const Job &job, const RayKernels &kernels) {
   return gains;
 }
 
+namespace {
+
+// A ray on its way to a rectangle of pixels, and the surfaces that may block it there.
+struct Crossing {
+  const Job &job;
+  const Visibility &v;
+  const Ray &ray;
+  std::vector<int> &nearer;                   // bins of surfaces that may block the ray
+  std::vector<const float *> &surface_light;  // memory
+
+  Crossing(const Job &job, const Visibility &v, const Ray &ray, int top, int bottom, int left, int right,
+           std::vector<int> &nearer, std::vector<const float *> &surface_light)
+      : job(job), v(v), ray(ray), nearer(nearer), surface_light(surface_light) {
+    nearer.clear();
+    for (int k : v.bins) {
+      if (!job.scene.occlusion || !(ray.coc - NEARER_PX > v.low + k)) break;
+      if (may_meet(k, top, left, bottom - top, right - left)) nearer.push_back(k);
+    }
+  }
+
+  // Whether rays that land in a rectangle may cross a surface of bin k.
+  bool may_meet(int k, int y, int x, int rows, int columns) const {
+    // a ray to a pixel at distance d from its source crosses the surface at distance along * d
+    const float along = 1.0f - (v.low + k) / ray.coc;
+    const float ya = ray.row + (y - ray.row) * along, yb = ray.row + (y + rows - 1 - ray.row) * along;
+    const float xa = ray.column + (x - ray.column) * along, xb = ray.column + (x + columns - 1 - ray.column) * along;
+    const auto cell = [](float at, int size) { return (int)std::clamp(at, 0.0f, size - 1.0f) / CELL; };
+    const int r0 = cell(std::floor(std::min(ya, yb)), job.height), r1 = cell(std::max(ya, yb) + 1, job.height);
+    const int c0 = cell(std::floor(std::min(xa, xb)), job.width), c1 = cell(std::max(xa, xb) + 1, job.width);
+    const uint64_t classes = v.classes_of(k), remainders = v.remainders_of(k);
+    for (int i = r0; i <= r1; i++)
+      for (int j = c0; j <= c1; j++)
+        if (v.may_show(v.cells[(size_t)i * v.cell_columns + j], classes, remainders)) return true;
+    return false;
+  }
+
+  // Accumulates the blocked share of the rays that land in a patch; returns whether all are blocked.
+  bool block_all(int y, int x, int rows, int columns, float (&blocked)[PATCH][PATCH]) const {
+    for (int k : nearer) {
+      if (!may_meet(k, y, x, rows, columns)) continue;
+      add_blocked(job, v, ray, k, y, x, rows, columns, surface_light.data(), blocked);
+      vec least_blocked = broadcast(1.0f);
+      for (int i = 0; i < rows; i++)
+        for (int j = 0; j < PATCH; j += LANES) least_blocked = min(least_blocked, load<vec>(blocked[i] + j));
+      if (!any_of(least_blocked < 1.0f)) return true;
+    }
+    return false;
+  }
+};
+
+}  // namespace
+
 // For each ray that reaches the tile:
 //
 // 1. Interpolate its kernel between the two nearest radii and mask it by the field, patch by patch.
@@ -532,8 +588,9 @@ std::vector<float> gains_of(const Job &job, const RayKernels &kernels) {
 // 3. Add light * tap * (1 - blocked), with blocked at most 1.
 void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays, int count,
            const RayKernels &ray_kernels, const std::vector<float> &gains, float *tile) {
-  const int H = job.height, W = job.width, C = job.channels, E = job.colours;
-  std::vector<int> nearer;  // bins of surfaces that may block the ray
+  const int C = job.channels, E = job.colours, y_end = std::min(y0 + TILE, job.height),
+            x_end = std::min(x0 + TILE, job.width);
+  std::vector<int> nearer;
   std::vector<const float *> surface_light(C);
   std::vector<FieldMask> masks;                        // one for each colour
   std::vector<float> taps((size_t)E * PATCH * PATCH);  // [colours, PATCH, PATCH]
@@ -543,41 +600,9 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
     const int half = half_of(ray_kernels, ray);
     masks.clear();
     for (int e = 0; e < E && !gains.empty(); e++) masks.push_back(mask_of(job, ray_kernels, ray, e));
-    const int top = std::max(y0, ray.row - half), bottom = std::min(std::min(y0 + TILE, H), ray.row + half + 1);
-    const int left = std::max(x0, ray.column - half), right = std::min(std::min(x0 + TILE, W), ray.column + half + 1);
-    // whether rays that land in a rectangle may cross a surface of bin k
-    auto may_meet = [&](int k, int y, int x, int rows, int columns) {
-      // a ray to a pixel at distance d from its source crosses the surface at distance along * d
-      const float along = 1.0f - (v.low + k) / ray.coc;
-      const float ya = ray.row + (y - ray.row) * along, yb = ray.row + (y + rows - 1 - ray.row) * along;
-      const float xa = ray.column + (x - ray.column) * along, xb = ray.column + (x + columns - 1 - ray.column) * along;
-      auto cell = [](float at, int size) { return (int)std::clamp(at, 0.0f, size - 1.0f) / CELL; };
-      const int r0 = cell(std::floor(std::min(ya, yb)), H), r1 = cell(std::max(ya, yb) + 1, H);
-      const int c0 = cell(std::floor(std::min(xa, xb)), W), c1 = cell(std::max(xa, xb) + 1, W);
-      const uint64_t classes = v.classes_of(k), remainders = v.remainders_of(k);
-      for (int i = r0; i <= r1; i++)
-        for (int j = c0; j <= c1; j++)
-          if (v.may_show(v.cells[(size_t)i * v.cell_columns + j], classes, remainders)) return true;
-      return false;
-    };
-    nearer.clear();
-    if (job.scene.occlusion)
-      for (int k : v.bins) {
-        if (!(ray.coc - NEARER_PX > v.low + k)) break;
-        if (may_meet(k, top, left, bottom - top, right - left)) nearer.push_back(k);
-      }
-    // accumulates the blocked share of the rays that land in a patch; true if all are blocked
-    auto block_all = [&](int y, int x, int rows, int columns, float (&blocked)[PATCH][PATCH]) {
-      for (int k : nearer) {
-        if (!may_meet(k, y, x, rows, columns)) continue;
-        add_blocked(job, v, ray, k, y, x, rows, columns, surface_light.data(), blocked);
-        vec least_blocked = broadcast(1.0f);
-        for (int i = 0; i < rows; i++)
-          for (int j = 0; j < PATCH; j += LANES) least_blocked = min(least_blocked, load<vec>(blocked[i] + j));
-        if (!any_of(least_blocked < 1.0f)) return true;
-      }
-      return false;
-    };
+    const int top = std::max(y0, ray.row - half), bottom = std::min(y_end, ray.row + half + 1);
+    const int left = std::max(x0, ray.column - half), right = std::min(x_end, ray.column + half + 1);
+    const Crossing crossing(job, v, ray, top, bottom, left, right, nearer, surface_light);
     for (int py = top; py < bottom; py += PATCH)
       for (int px = left; px < right; px += PATCH) {
         const int ny = std::min(PATCH, bottom - py), nx = std::min(PATCH, right - px);
@@ -586,18 +611,18 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
           const float gain = gains.empty() ? 0.0f : gains[(size_t)rays[r] * E + e];
           for (int i = 0; i < ny; i++) {
             float *row = &taps[(e * PATCH + i) * PATCH];
+            const vec dy = broadcast((float)(py + i - ray.row));
             std::fill(row, row + PATCH, 0.0f);
             add_taps(ray_kernels, ray, e, py + i - ray.row, px - ray.column, nx, row);
-            for (int x = 0; x < nx && gain > 0; x += LANES)
-              if (any_positive(load<vec>(row + x)))
-                store(row + x, load<vec>(row + x) * gain *
-                                   masks[e].transmittance(broadcast((float)(py + i - ray.row)),
-                                                          (float)(px + x - ray.column) + iota()));
+            for (int x = 0; x < nx && gain > 0; x += LANES) {
+              const vec tap = load<vec>(row + x), dx = (float)(px + x - ray.column) + iota();
+              if (any_positive(tap)) store(row + x, tap * gain * masks[e].transmittance(dy, dx));
+            }
             for (int x = 0; x < PATCH; x += LANES) any |= any_positive(load<vec>(row + x));
           }
         }
         float blocked[PATCH][PATCH] = {};
-        if (!any || block_all(py, px, ny, nx, blocked)) continue;
+        if (!any || crossing.block_all(py, px, ny, nx, blocked)) continue;
         for (int c = 0; c < C; c++)
           for (int i = 0; i < ny; i++) {
             const float *row = &taps[((E > 1 ? c : 0) * PATCH + i) * PATCH];

@@ -5,6 +5,7 @@
 #include <cstdint>
 #include <cstdlib>
 #include <cstring>
+#include <functional>
 #include <numeric>
 #include <vector>
 
@@ -136,6 +137,19 @@ double mean_change(const float *coc, int height, int width, int threads) {
   return std::accumulate(changes.begin(), changes.end(), 0.0) / ((double)height * width);
 }
 
+// Mean radius of the widest pixels of a map, 1 of FEW, so that a single one does not decide: the largest of all maps.
+static double mean_of_widest(const float *coc, int maps, int64_t area, float reach) {
+  double usual = 1;
+  std::vector<float> radii(area);
+  const auto most = radii.begin() + (area + FEW - 1) / FEW;
+  for (const float *map = coc; map < coc + maps * area; map += area) {
+    for (int64_t i = 0; i < area; i++) radii[i] = std::isnan(map[i]) ? 0.0f : std::min(std::fabs(map[i]), reach);
+    std::nth_element(radii.begin(), most - 1, radii.end(), std::greater<float>());
+    usual = std::max(usual, std::accumulate(radii.begin(), most, 0.0) / (double)(most - radii.begin()));
+  }
+  return usual;
+}
+
 // 1. Fixed nodes: the nearest and the farthest place, and places with much of the border, with a neighbour on each
 // side.
 // 2. Nodes from the focus outwards, with a spacing that grows with the blur and the tolerance.
@@ -152,24 +166,13 @@ std::vector<double> plan(const float *coc, int maps, int height, int width, doub
   auto place = [&](float c) { return axis(std::isnan(c) ? 0.0f : std::clamp(c, -reach, reach), -INFINITY, INFINITY); };
   const double nearest = place(low), farthest = place(high);
   double widest = std::max({-(double)coc_at(nearest), (double)coc_at(farthest), 1.0});  // px
-  if (SMALL_RADII * widest >
-      std::min(height, width)) {  // the mean of the widest pixels, 1 of FEW, so that a single one does not decide
-    double usual = 1;
-    std::vector<float> radii(area);
-    const auto most = radii.begin() + (area + FEW - 1) / FEW;
-    for (const float *map = coc; map < coc + maps * area; map += area) {
-      for (int64_t i = 0; i < area; i++) radii[i] = std::isnan(map[i]) ? 0.0f : std::min(std::fabs(map[i]), reach);
-      std::nth_element(radii.begin(), most - 1, radii.end(), std::greater<float>());
-      usual = std::max(usual, std::accumulate(radii.begin(), most, 0.0) / (double)(most - radii.begin()));
-    }
-    widest = usual;
-  }
+  if (SMALL_RADII * widest > std::min(height, width)) widest = mean_of_widest(coc, maps, area, reach);
   double change = INFINITY;
   for (int i = 0; i < maps; i++) change = std::min(change, mean_change(coc + i * area, height, width, threads));
   tolerance *= std::min(1.0, std::min(height, width) / (SMALL_RADII * widest));
   tolerance = std::max(tolerance, std::min(tolerance * std::sqrt(change / ROUGH_PX), ROUGH_TOLERANCE));
   if (farthest <= nearest) return {nearest};
-  std::vector<float> border;
+  std::vector<float> border;  // places of the pixels at the frame's border
   for (const float *map = coc; map < coc + maps * area; map += area) {
     for (int x = 0; x < width; x++) border.insert(border.end(), {place(map[x]), place(map[area - width + x])});
     for (int y = 0; y < height; y++)
