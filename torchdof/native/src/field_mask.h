@@ -86,14 +86,14 @@ class FieldMask {
       vec mean[2];
       for (int k = 0; k < 2; k++) {
         const float *p = k ? next : values;
-        vec corner[4] = {};
-        for (int lane = 0; lane < LANES; lane++) {
-          const float *from = p + first[lane];
-          corner[0][lane] = from[0], corner[1][lane] = from[1], corner[2][lane] = from[columns],
-          corner[3][lane] = from[columns + 1];
-        }
-        const vec upper = corner[0] + right * (corner[1] - corner[0]),
-                  lower = corner[2] + right * (corner[3] - corner[2]);
+        const auto samples = [&](int offset) {
+          vec v = {};
+          for (int lane = 0; lane < LANES; lane++) v[lane] = p[first[lane] + offset];
+          return v;
+        };
+        const vec corners[4] = {samples(0), samples(1), samples(columns), samples(columns + 1)};
+        const vec upper = corners[0] + right * (corners[1] - corners[0]);
+        const vec lower = corners[2] + right * (corners[3] - corners[2]);
         mean[k] = upper + down * (lower - upper);
       }
       return clamp01(mean[0] + near * (mean[1] - mean[0]));
