@@ -86,9 +86,11 @@ class FieldMask {
       vec mean[2];
       for (int k = 0; k < 2; k++) {
         const float *p = k ? next : values;
+        const float *from[LANES];
+        for (int lane = 0; lane < LANES; lane++) from[lane] = p + first[lane];
         const auto samples = [&](int offset) {
           vec v = {};
-          for (int lane = 0; lane < LANES; lane++) v[lane] = p[first[lane] + offset];
+          for (int lane = 0; lane < LANES; lane++) v[lane] = from[lane][offset];
           return v;
         };
         const vec corners[4] = {samples(0), samples(1), samples(columns), samples(columns + 1)};
