@@ -3,7 +3,7 @@
 A constant has one definition, in the Python module whose comment gives its meaning and unit. C++ includes
 ``constants/disocclusion.h`` and reads ``_FALL`` of ``render/surfaces/disocclusion.py`` as
 ``constants::disocclusion::FALL``. The build runs this file, which reads the sources without importing them. A checksum
-of ``native/api.h`` tells the engine which interface it was compiled with.
+of ``native/api.h`` identifies the interface with which the engine was compiled.
 """
 
 import ast

@@ -41,7 +41,7 @@ struct Level {
   float coc(int y, int x) const { return at(y, x)[channels]; }
 };
 
-// While hidden surfaces are filled, the sign of a second surface's weight tells its kind: minus for a hidden surface,
+// While hidden surfaces are filled, the sign of a second surface's weight gives its kind: minus for a hidden surface,
 // plus for one that matting found.
 inline vec as_hidden(vec weight) { return -weight; }
 inline bool is_hidden(float weight) { return weight < 0; }
