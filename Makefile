@@ -50,6 +50,9 @@ install: $(INSTALLED)
 check: $(INSTALLED) package
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/clang-format --dry-run --Werror torchdof/native/*.h torchdof/native/src/* tests/native/*.cpp
+	! command -v $(CXX) >/dev/null || $(CXX) -std=c++17 -fsyntax-only -Wall -Wextra -Werror -Wno-psabi \
+		-Itorchdof/native -Ibuild torchdof/native/src/*.cpp tests/native/*.cpp
 	MYPYPATH=build/package $(BIN)/mypy -p torchdof
 	MYPYPATH=build/package $(BIN)/mypy tests examples
 

@@ -2,7 +2,8 @@
 
 A constant has one definition, in the Python module whose comment gives its meaning and unit. C++ includes
 ``constants/disocclusion.h`` and reads ``_FALL`` of ``render/surfaces/disocclusion.py`` as
-``constants::disocclusion::FALL``. The build runs this file, which reads the sources without importing them.
+``constants::disocclusion::FALL``. The build runs this file, which reads the sources without importing them. A checksum
+of ``native/api.h`` identifies the interface with which the engine was compiled.
 """
 
 import ast
@@ -75,13 +76,18 @@ def _value(node: ast.AST | None, constants: dict[str, Value]) -> Any:
 
 
 def headers() -> dict[str, str]:
-    """The text of each header by its name; ``checksum`` has one number that changes with any constant."""
+    """The text of each header by its name.
+
+    ``checksum`` has a number that changes with any constant, and one that changes with the C interface.
+    """
     texts = {}
     for module in MODULES:
         name = module.removesuffix("/__init__").rpartition("/")[2]
         texts[name] = _header(name, [_line(*item) for item in constants_of(module).items()])
-    checksum = zlib.crc32("".join(texts.values()).encode())
-    return texts | {"checksum": _header("checksum", [f"constexpr uint32_t ALL = {checksum}u;"])}
+    interface = (PACKAGE / "native" / "api.h").read_text(encoding="utf-8")
+    checked = {"ALL": "".join(texts.values()), "INTERFACE": interface}
+    lines = [f"constexpr uint32_t {name} = {zlib.crc32(text.encode())}u;" for name, text in checked.items()]
+    return texts | {"checksum": _header("checksum", lines)}
 
 
 def _header(name: str, lines: list[str]) -> str:

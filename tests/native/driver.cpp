@@ -30,8 +30,7 @@ std::vector<float> disc(double radius, int half, int colours) {
   const int size = 2 * half + 1;
   std::vector<float> kernel;
   for (int y = -half; y <= half; y++)
-    for (int x = -half; x <= half; x++)
-      kernel.push_back(float(std::clamp(radius + 0.5 - std::hypot(x, y), 0.0, 1.0)));
+    for (int x = -half; x <= half; x++) kernel.push_back(float(std::clamp(radius + 0.5 - std::hypot(x, y), 0.0, 1.0)));
   kernel[half * size + half] += 1e-3f;
   double sum = 0;
   for (float value : kernel) sum += value;
@@ -210,15 +209,18 @@ void check(unsigned seed) {
       if (!std::isfinite(value)) fail("finite light gives a picture that is not", number);
 
   float low = 0, high = 0;
-  if (torchdof_ends(alone.data(), int64_t(alone.size()), 3, &low, &high) != TORCHDOF_OK) fail("its ends cannot be told", number);
-  if (!scene.scene.masked && (low != *std::min_element(alone.begin(), alone.end()) || high != *std::max_element(alone.begin(), alone.end())))
+  if (torchdof_ends(alone.data(), int64_t(alone.size()), 3, &low, &high) != TORCHDOF_OK)
+    fail("its ends cannot be told", number);
+  if (!scene.scene.masked &&
+      (low != *std::min_element(alone.begin(), alone.end()) || high != *std::max_element(alone.begin(), alone.end())))
     fail("its ends are wrong", number);
 
   std::vector<std::thread> callers;
   for (int threads : {2, 3, 8})
     callers.emplace_back([&, threads] {
       std::vector<float> picture;
-      if (render(scene.scene, threads, &never, picture) != TORCHDOF_OK) fail("several threads cannot render it", number);
+      if (render(scene.scene, threads, &never, picture) != TORCHDOF_OK)
+        fail("several threads cannot render it", number);
       if (!same_bits(alone, picture)) fail("the number of threads changes the picture", number);
     });
   int32_t cancelled = 0;
@@ -256,13 +258,24 @@ void check_edges(unsigned seed) {
   const torchdof_scene &scene = made.scene;
   const size_t pixels = size_t(scene.height) * scene.width;
   std::vector<float> nearness = made.coc[0];
-  for (size_t i = 0; seed % 2 && i + 2 < pixels; i++) nearness[i] = (made.coc[0][i] + made.coc[0][i + 1] + made.coc[0][i + 2]) / 3;
+  for (size_t i = 0; seed % 2 && i + 2 < pixels; i++)
+    nearness[i] = (made.coc[0][i] + made.coc[0][i + 1] + made.coc[0][i + 2]) / 3;
   const std::vector<float> steps(pixels, 0.5f);
   const auto repair = [&](int threads) {
     std::vector<float> out(pixels);
     const int32_t never = 0;
-    const torchdof_map map = {scene.height, scene.width, scene.channels, made.light[0].data(), nearness.data(),
-                              int(seed) % 2, seed % 3 ? nullptr : steps.data(), 1.0f, int(seed) % 5 == 0, threads, &never, out.data()};
+    const torchdof_map map = {scene.height,
+                              scene.width,
+                              scene.channels,
+                              made.light[0].data(),
+                              nearness.data(),
+                              int(seed) % 2,
+                              seed % 3 ? nullptr : steps.data(),
+                              1.0f,
+                              int(seed) % 5 == 0,
+                              threads,
+                              &never,
+                              out.data()};
     int32_t changed = 0;
     if (torchdof_repair_edges(&map, &changed) != TORCHDOF_OK) fail("its edges cannot be repaired", int(seed));
     if (!changed) out = nearness;
@@ -283,7 +296,9 @@ std::vector<float> noise(std::mt19937 &random, size_t count, double low, double 
   return values;
 }
 
-void append(std::vector<float> &all, const std::vector<float> &more) { all.insert(all.end(), more.begin(), more.end()); }
+void append(std::vector<float> &all, const std::vector<float> &more) {
+  all.insert(all.end(), more.begin(), more.end());
+}
 
 // Blends one surface or two with the layers of a scene, and computes the gradient.
 void check_blend(unsigned seed) {
@@ -334,7 +349,8 @@ void check_blend(unsigned seed) {
     const int result = torchdof_blend(&its_frame, all.data(), nullptr, nullptr, nullptr, nullptr);
     if (result != TORCHDOF_CANCELLED && result != TORCHDOF_OK) fail("cancelling its layers is an error", int(seed));
     its_frame.cancelled = &never;
-    if (torchdof_blend(&its_frame, all.data(), nullptr, nullptr, nullptr, nullptr) != TORCHDOF_OK) fail("its layers cannot be blended", int(seed));
+    if (torchdof_blend(&its_frame, all.data(), nullptr, nullptr, nullptr, nullptr) != TORCHDOF_OK)
+      fail("its layers cannot be blended", int(seed));
     std::vector<float> of_light[2], of_place[2], of_weight[2];
     float *of_light_at[2], *of_place_at[2], *of_weight_at[2];
     for (int s = 0; s < frame.surfaces; s++) {
@@ -358,7 +374,8 @@ void check_blend(unsigned seed) {
 void check_look_behind(unsigned seed) {
   std::mt19937 random(seed);
   const auto integer = [&](int low, int high) { return std::uniform_int_distribution<int>(low, high)(random); };
-  const int channels = integer(1, torchdof::constants::native::MOST_PLANES), count = integer(1, torchdof::constants::native::MOST_LEVELS);
+  const int channels = integer(1, torchdof::constants::native::MOST_PLANES),
+            count = integer(1, torchdof::constants::native::MOST_LEVELS);
   const int rows = (2 << count) * integer(1, 5), columns = (2 << count) * integer(1, 7);  // pixels of all levels
   const int height = integer(1, rows), width = integer(1, columns);
   const size_t pixels = size_t(height) * width;
@@ -382,11 +399,11 @@ void check_look_behind(unsigned seed) {
     std::vector<float *> of_levels_at;
     for (const std::vector<float> &of_level : values) of_levels.emplace_back(of_level.size(), 0.0f);
     for (std::vector<float> &of_level : of_levels) of_levels_at.push_back(of_level.data());
-    if (torchdof_look_behind(levels.data(), count, channels, coc.data(), wanted, height, width, threads, all.data(), nullptr,
-                             nullptr, nullptr) != TORCHDOF_OK)
+    if (torchdof_look_behind(levels.data(), count, channels, coc.data(), wanted, height, width, threads, all.data(),
+                             nullptr, nullptr, nullptr) != TORCHDOF_OK)
       fail("surfaces behind cannot be found", int(seed));
-    if (torchdof_look_behind(levels.data(), count, channels, coc.data(), wanted, height, width, threads, nullptr, slopes.data(),
-                             of_levels_at.data(), of_coc.data()) != TORCHDOF_OK)
+    if (torchdof_look_behind(levels.data(), count, channels, coc.data(), wanted, height, width, threads, nullptr,
+                             slopes.data(), of_levels_at.data(), of_coc.data()) != TORCHDOF_OK)
       fail("surfaces behind have no gradient", int(seed));
     append(all, of_coc);
     for (const std::vector<float> &of_level : of_levels) append(all, of_level);
@@ -427,7 +444,8 @@ void check_continued(unsigned seed) {
   const int32_t ends[] = {integer(0, 50), integer(0, 50), integer(0, 50), integer(0, 50)};
   const size_t pixels = size_t(height) * width, wide = size_t(height + ends[2] + ends[3]) * (width + ends[0] + ends[1]);
   std::vector<std::vector<float>> maps;  // light, coc and weight of each surface; limit
-  for (int s = 0; s < 3 * surfaces; s++) maps.push_back(noise(random, (s < surfaces ? channels : 1) * pixels, 0.0, s / surfaces == 1 ? 9.0 : 1.0));
+  for (int s = 0; s < 3 * surfaces; s++)
+    maps.push_back(noise(random, (s < surfaces ? channels : 1) * pixels, 0.0, s / surfaces == 1 ? 9.0 : 1.0));
   maps.push_back(noise(random, pixels, 0.3, 1.3));
   const int image = integer(-1, surfaces - 1);
   const std::vector<float> slopes = noise(random, surfaces * (channels + 2) * wide, -1.0, 1.0);
@@ -439,10 +457,12 @@ void check_continued(unsigned seed) {
     for (const std::vector<float> &map : maps) of_maps.emplace_back(map.size(), 0.0f), maps_at.push_back(map.data());
     for (std::vector<float> &of_map : of_maps) of_maps_at.push_back(of_map.data());
     const auto step = [&](float *out, const float *gradient, float *const *of) {
-      return torchdof_continued(maps_at.data(), surfaces, channels, height, width, ends, 0.5f, 7.0f, image, threads, out, gradient, of);
+      return torchdof_continued(maps_at.data(), surfaces, channels, height, width, ends, 0.5f, 7.0f, image, threads,
+                                out, gradient, of);
     };
     if (step(all.data(), nullptr, nullptr) != TORCHDOF_OK) fail("its light cannot be continued", int(seed));
-    if (step(nullptr, slopes.data(), of_maps_at.data()) != TORCHDOF_OK) fail("its continued light has no gradient", int(seed));
+    if (step(nullptr, slopes.data(), of_maps_at.data()) != TORCHDOF_OK)
+      fail("its continued light has no gradient", int(seed));
     for (const std::vector<float> &of_map : of_maps) append(all, of_map);
     return all;
   };

@@ -17,7 +17,7 @@ from torchdof.kernels import loader
 ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / "cmake" / "constants.py"
 SOURCES = sorted(
-    [*(ROOT / "torchdof" / "native" / "src").glob("*.[ch]*"), *(ROOT / "torchdof" / "kernels").glob("*.[ch]*")]
+    file for name in ("native", "native/src", "kernels") for file in (ROOT / "torchdof" / name).glob("*.[ch]*")
 )
 DEFINITION = re.compile(r"constexpr \w+ (\w+)(?:\[\])? = (.*);")
 
@@ -70,6 +70,7 @@ def test_a_number_changed_in_python_reaches_the_header(tmp_path: Path) -> None:
         copy = tmp_path / "torchdof" / f"{name}.py"
         copy.parent.mkdir(parents=True, exist_ok=True)
         copy.write_text((ROOT / "torchdof" / f"{name}.py").read_text())
+    (tmp_path / "torchdof" / "native" / "api.h").write_text((ROOT / "torchdof" / "native" / "api.h").read_text())
     (tmp_path / "cmake").mkdir()
     (tmp_path / "cmake" / "constants.py").write_text(SCRIPT.read_text())
 
@@ -89,8 +90,9 @@ def test_a_number_changed_in_python_reaches_the_header(tmp_path: Path) -> None:
 @pytest.mark.skipif(not native.chosen(), reason="the compiled engine is not built")
 def test_the_engine_was_compiled_with_the_numbers_of_these_sources() -> None:
     """`make install` compiles it again after a number has changed."""
-    (checksum,) = written(CONSTANTS.headers()["checksum"]).values()
-    assert native._engine().torchdof_constants() == checksum
+    checksums = written(CONSTANTS.headers()["checksum"])
+    assert native._engine().torchdof_constants() == checksums["ALL"]
+    assert native._engine().torchdof_interface() == checksums["INTERFACE"]
 
 
 @pytest.mark.parametrize("name", loader.HEADERS)

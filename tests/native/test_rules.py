@@ -34,7 +34,7 @@ RULES: dict[str, Callable[[Tensor], Tensor]] = {
     "stands_in(v)[0]": frame.stands_in,
     "counts(v)[0]": frame.counts,
     "seen(v)[0]": frame.seen,
-    "(v + raise(lacking(all(5e-4f), v)))[0]": lambda x: composite.raised(torch.full_like(x, 5e-4), x),
+    "(v + raise(lacking(broadcast(5e-4f), v)))[0]": lambda x: composite.raised(torch.full_like(x, 5e-4), x),
 }
 # C++ expression of a derivative -> the rule
 SLOPES: dict[str, str] = {
@@ -47,7 +47,7 @@ SLOPES: dict[str, str] = {
     "slope_of_stands_in(v)[0]": "stands_in(v)[0]",
     "slope_of_counts(v)[0]": "counts(v)[0]",
     "slope_of_seen(v)[0]": "seen(v)[0]",
-    "1.0f + slope_of_raise(lacking(all(5e-4f), v))[0]": "(v + raise(lacking(all(5e-4f), v)))[0]",
+    "1.0f + slope_of_raise(lacking(broadcast(5e-4f), v))[0]": "(v + raise(lacking(broadcast(5e-4f), v)))[0]",
     "float(within(unlimited_another_surface(x)))": "is_another_surface(x)",
 }
 # beside and between the limits of all rules, not on them
@@ -62,14 +62,15 @@ def computed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Tensor]:
     folder = tmp_path_factory.mktemp("rules")
     lines = [f'    std::printf("%.9g ", (double)({expression}));' for expression in [*RULES, *SLOPES]]
     source = f"""
-#include "engine.h"
 #include "rules.h"
+#include "simd.h"
 #include <cmath>
 #include <cstdio>
+#include <initializer_list>
 using namespace torchdof;
 int main() {{
   for (const float x : {{{", ".join(f"{value!r}f" for value in X.tolist())}}}) {{
-    const vec v = all(x);
+    const vec v = broadcast(x);
 {chr(10).join(lines)}
   }}
 }}

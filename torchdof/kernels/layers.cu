@@ -26,8 +26,8 @@ extern "C" __global__ void mark(const __grid_constant__ Run r) {
   for (int j = 0; j < SURFACES; j++)
     for (int i = 0; i < r.scale * r.scale; i++) {
       const float place = r.place[j][blockIdx.z * area_of_frame(r) + first + i / r.scale * r.frame_columns + i % r.scale];
-      low[j] = i ? least(low[j], place) : place;
-      high[j] = i ? most(high[j], place) : place;
+      low[j] = i ? torchdof::min(low[j], place) : place;
+      high[j] = i ? torchdof::max(high[j], place) : place;
     }
   for (int i = 0; i < r.layers; i++) {
     const Ramps l = ramps_of(r, item, i);
@@ -43,10 +43,10 @@ extern "C" __global__ void mark(const __grid_constant__ Run r) {
 // Whether a table of tiles has one within `half` pixels of a tile. One thread a tile; blockIdx.z counts items, and layers in them.
 __device__ inline bool any_near(const Run &r, const signed char *table, int row, int column) {
   const int layer = blockIdx.z % r.layers, half = r.half[layer], item = blockIdx.z / r.layers * r.colours;
-  const int last_row = least((row * TILE_ROWS + TILE_ROWS - 1 + half) / TILE_ROWS, r.tile_rows - 1);
-  const int last_column = least((column * TILE_COLUMNS + TILE_COLUMNS - 1 + half) / TILE_COLUMNS, r.tile_columns - 1);
-  for (int y = most(row * TILE_ROWS - half, 0) / TILE_ROWS; y <= last_row; y++)
-    for (int x = most(column * TILE_COLUMNS - half, 0) / TILE_COLUMNS; x <= last_column; x++)
+  const int last_row = min((row * TILE_ROWS + TILE_ROWS - 1 + half) / TILE_ROWS, r.tile_rows - 1);
+  const int last_column = min((column * TILE_COLUMNS + TILE_COLUMNS - 1 + half) / TILE_COLUMNS, r.tile_columns - 1);
+  for (int y = max(row * TILE_ROWS - half, 0) / TILE_ROWS; y <= last_row; y++)
+    for (int x = max(column * TILE_COLUMNS - half, 0) / TILE_COLUMNS; x <= last_column; x++)
       if (table[tile_at(r, item, layer, y, x)]) return true;
   return false;
 }
@@ -90,8 +90,8 @@ extern "C" __global__ void terms(const __grid_constant__ Run r) {
 __device__ inline void convolve(const Run &r, const float *planes, int item, int layer, int y, int x, bool turned, float (&sum)[ROWS][VALUES]) {
   const int half = r.half[layer], side = 2 * half + 1, step = turned ? -1 : 1;
   const float *const kernel = r.kernel[layer] + (long long)(item % r.sets) * side * side + (turned ? side * side - 1 : 0);
-  const int first = most(half - y, 0), last = least(side + ROWS - 1, r.rows + half - y);  // rows of the grid that are read
-  for (int dx = most(half - x, 0); dx < least(side, r.columns + half - x); dx++) {
+  const int first = max(half - y, 0), last = min(side + ROWS - 1, r.rows + half - y);  // rows of the grid that are read
+  for (int dx = max(half - x, 0); dx < min(side, r.columns + half - x); dx++) {
     auto tap_at = [&](int dy) { return dy >= 0 && dy < side ? kernel[step * (dy * side + dx)] : 0.0f; };
     float tap[ROWS], part[ROWS][VALUES] = {};
     for (int j = 0; j < ROWS; j++) tap[j] = tap_at(first - 1 - j);
@@ -287,7 +287,7 @@ __device__ inline float coarse_at(const Run &r, int item, int plane, const Taps 
   return above + t.down * (below - above);
 }
 // The part of the picture that passes through a coarse canvas, by its last plane.
-__device__ inline float passing(const Run &r, float last_plane) { return r.backed ? last_plane : most(1 - last_plane, 0.0f); }
+__device__ inline float passing(const Run &r, float last_plane) { return r.backed ? last_plane : torchdof::max(1 - last_plane, 0.0f); }
 
 // Lays a coarse canvas over the picture.
 extern "C" __global__ void upsample(const __grid_constant__ Run r) {
@@ -305,8 +305,8 @@ extern "C" __global__ void upsample_back(const __grid_constant__ Run r) {
   const int row = pixel_row(), column = pixel_column(), item = blockIdx.z, s = r.scale;
   if (row >= r.coarse_height || column >= r.coarse_width) return;
   float sum[PLANES] = {};
-  for (int y = most(s * row - 3 * s / 2, 0); y < least(s * row + s / 2, r.height); y++)
-    for (int x = most(s * column - 3 * s / 2, 0); x < least(s * column + s / 2, r.width); x++) {
+  for (int y = max(s * row - 3 * s / 2, 0); y < min(s * row + s / 2, r.height); y++)
+    for (int x = max(s * column - 3 * s / 2, 0); x < min(s * column + s / 2, r.width); x++) {
       const Taps t = taps_at(r, y, x);
       const float weight = (t.row == row ? 1 - t.down : t.down) * (t.column == column ? 1 - t.right : t.right);
       float of_left = 0;

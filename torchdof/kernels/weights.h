@@ -32,7 +32,7 @@ __device__ inline Stack stack_of(const Ramps &l, const Pixel &p) {
     t.b[j] = ramp(l.behind(p.place[j]), true);
     t.h[j] = p.weight[j] * ramp(t.a[j] / HIDING_SHARE, true);
     t.hidden[j] = t.h[j] * (1 - t.a[j]);
-    t.s[j] = p.weight[j] * (t.a[j] - t.b[j]) / most(1 - t.hidden[j], LEAST_PASSING);
+    t.s[j] = p.weight[j] * (t.a[j] - t.b[j]) / torchdof::max(1 - t.hidden[j], LEAST_PASSING);
   }
   return t;
 }
@@ -55,7 +55,7 @@ __device__ inline void weigh_back(const Ramps &l, const Pixel &p, const Weights 
   float of_visible = of.beyond * known, of_arriving = 0;  // of_arriving: by the light that arrives at the next surface
   for (int j = 0; j < SURFACES; j++) of_visible += (of.own[j] - of.beyond) * left_by(t.s, j, -1) * t.s[j];
   for (int j = SURFACES - 1; j >= 0; j--) {
-    const float of_stopped = (of.own[j] - of.beyond) * visible, passing = most(1 - t.hidden[j], LEAST_PASSING);
+    const float of_stopped = (of.own[j] - of.beyond) * visible, passing = torchdof::max(1 - t.hidden[j], LEAST_PASSING);
     const float of_s = left_by(t.s, j, -1) * (of_stopped - of_arriving), of_difference = of_s * p.weight[j] / passing;
     of_arriving = of_stopped * t.s[j] + (1 - t.s[j]) * of_arriving;
     const float of_hidden = (1 - t.hidden[j] >= LEAST_PASSING ? of_s * t.s[j] / passing : 0.0f) - of_visible * left_by(t.hidden, SURFACES, j);

@@ -1,6 +1,6 @@
 """The compiled engine: the computations of :mod:`torchdof.render` in C++, for eager inference on the CPU.
 
-It has a plain C interface (``src/api.h``) and is built when the package is installed. Without it the PyTorch engine is
+It has a plain C interface (``api.h``) and is built when the package is installed. Without it the PyTorch engine is
 used. The environment variable ``TORCHDOF_ENGINE`` selects: ``auto`` (the default) uses compiled code where it can,
 ``native`` requires this engine on the CPU, ``gpu`` requires the kernels of :mod:`torchdof.kernels` on CUDA devices, and
 ``torch`` uses PyTorch alone. The instruction set is the one that PyTorch uses, AVX2 or the
@@ -17,11 +17,13 @@ import functools
 import importlib.resources
 import itertools
 import os
+import re
 import sys
 import threading
 import warnings
+import zlib
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -40,9 +42,7 @@ _instructions = "avx2" if torch.backends.cpu.get_cpu_capability().startswith("AV
 
 _ENGINES = ("auto", "native", "gpu", "torch")  # values of TORCHDOF_ENGINE
 _SMALL_FRAME = 2**16  # pixels; up to this size the main thread renders itself, which saves 0.1 ms
-_NO_MEMORY, _CANCELLED, _TOO_BRIGHT = 1, 2, 3
 _of_thread = threading.local()  # count: threads for calls of this thread; is_off: they use the plain engine
-_REVISION = 16  # of ``src/api.h``
 
 Rules = Sequence[tuple[int, float, float, float]]
 
@@ -71,45 +71,7 @@ class Spots(NamedTuple):
     gradients. The engine ignores them."""
 
 
-_TYPES: dict[str, Any] = {
-    **{"int": ctypes.c_int32, "long": ctypes.c_int64, "real": ctypes.c_float, "double": ctypes.c_double},
-    **{"data": ctypes.c_void_p, "nothing": None},
-}
-_LAYERS = "int layers, double* nodes, int* scales halves, int kernel_colours, data kernels"
-_STRUCTURES = {
-    "field_mask": "data values boxes, real radius, int colours rows columns",
-    "spots": "int count colours, data* templates, int* cells index, double* part finer reach fade, int* flipped half, "
-    "double squeeze, int round even",
-    "scene": "int height width channels kind surfaces, data* light coc weight, data covered, int occlusion normalize, "
-    f"int masked highlights, real crisp_px reach, {_LAYERS}, field_mask* field_masks, int distances, real squeeze, "
-    "int threads, int* cancelled",
-    "map": "int height width channels, data light nearness, int of_coc, data steps, real step, int automatic threads, "
-    "int* cancelled, data out",
-    "layers": "int rows columns margin height width channels surfaces, data* light place weight, int occlusion backed, "
-    f"{_LAYERS}, int threads, int* cancelled",
-    "level": "data values, int rows columns step, real least_px slope most",
-}
-"""Structures of ``src/api.h``: types with the fields that have them. Data are pointers to numbers."""
-
-_FUNCTIONS = {
-    "begin": "int scene* data*",
-    "radii": "long data int**",
-    "finish": "int data data* int* field_mask* int data",
-    "free": "nothing data",
-    "repair_edges": "int map* int*",
-    "blend": "int layers* data data data* data* data*",
-    "matte": "int data* int int int int data data data*",
-    "farthest": "int data* int int int int int int data data data*",
-    "look_behind": "int level* int int data data int int int data data data* data",
-    "continued": "int data* int int int int int* real real int int data data data*",
-    "coc": "int data long real real real int data",
-    "plan": "int data int int int double* int double* int int*",
-    "kernels": "int spots* int data*",
-    "ends": "int data long int real* real*",
-    "interface": "long",
-    "constants": "long",
-}
-"""Functions of ``src/api.h``: types of the result and of the arguments."""
+_NUMBERS = {"int32_t": ctypes.c_int32, "int64_t": ctypes.c_int64, "float": ctypes.c_float, "double": ctypes.c_double}
 
 
 class _Structure(ctypes.Structure):
@@ -120,14 +82,69 @@ class _Structure(ctypes.Structure):
         super().__init__(*(_plain(field[1], value) for field, value in zip(self._fields_, self.kept, strict=True)))
 
 
-def _type(name: str) -> Any:
-    return ctypes.POINTER(_type(name[:-1])) if name.endswith("*") else _TYPES[name]
+class Interface(NamedTuple):
+    """What a header declares, by names without ``torchdof_`` and ``TORCHDOF_``."""
+
+    constants: dict[str, int]
+    structures: dict[str, type[_Structure]]
+    functions: dict[str, tuple[Any, list[Any]]]  # type of the result, and types of the arguments
+    checksum: int  # of the header's text, as cmake/constants.py computes it
 
 
-for _name, _groups in _STRUCTURES.items():
-    _of_type = (group.split() for group in _groups.split(", "))
-    _fields = [(field, _type(kind)) for kind, *fields in _of_type for field in fields]
-    _TYPES[_name] = type(_name, (_Structure,), {"_fields_": _fields})
+def read_header(header: str) -> Interface:
+    """Constants, structures and functions of a header of plain C: enums, structures and functions of numbers.
+
+    A pointer to ``float`` has the type of any pointer, because tensors are passed as addresses; so has one to a
+    structure without fields.
+
+    Raises:
+        ValueError: If the header has another declaration than these; the reader must then be extended.
+    """
+    found = Interface({}, {}, {}, zlib.crc32(header.encode()))
+    types: dict[str, Any] = {**_NUMBERS, "void": None}
+
+    def declared(text: str) -> list[tuple[str, Any]]:
+        """Names and types of ``const int32_t *first, second``."""
+        match = re.fullmatch(r"(?:const |volatile )*(\w+) ?(.*)", text.strip())
+        if match is None or match[1] not in types:
+            raise ValueError
+        pairs = []
+        for declarator in match[2].split(","):
+            parts = re.fullmatch(r" ?((?:\*(?:const )?)*)(\w+)", declarator)
+            if parts is None:
+                raise ValueError
+            kind, depth = types[match[1]], parts[1].count("*")
+            if depth and (match[1] == "float" or kind is None):
+                kind, depth = ctypes.c_void_p, depth - 1
+            for _ in range(depth):
+                kind = ctypes.POINTER(kind)
+            pairs.append((parts[2], kind))
+        return pairs
+
+    code = re.sub(r"//.*|^ *#.*", "", header, flags=re.MULTILINE)
+    for statement in re.findall(r"(?:[^;{]|\{[^}]*\})+;?", " ".join(code.split())):
+        try:
+            if match := re.fullmatch(r" ?enum \{(.*?),? ?\};", statement):
+                pairs = (item.split("=") for item in match[1].split(","))
+                found.constants.update({name.strip().removeprefix("TORCHDOF_"): int(value) for name, value in pairs})
+            elif match := re.fullmatch(r" ?typedef struct (torchdof_\w+) \1;", statement):
+                types[match[1]] = None
+            elif match := re.fullmatch(r" ?typedef struct \{(.*); \} torchdof_(\w+);", statement):
+                fields = [pair for text in match[1].split(";") for pair in declared(text)]
+                types[f"torchdof_{match[2]}"] = made = type(match[2], (_Structure,), {"_fields_": fields})
+                found.structures[match[2]] = made
+            elif match := re.fullmatch(r" ?TORCHDOF_API (\w+) torchdof_(\w+)\((.*)\);", statement):
+                arguments = [] if match[3] == "void" else [declared(text)[0][1] for text in match[3].split(",")]
+                found.functions[match[2]] = types[match[1]], arguments
+            elif statement.strip():
+                raise ValueError
+        except (KeyError, ValueError):
+            text = f"api.h has a declaration that the reader in native/__init__.py does not know: {statement.strip()}"
+            raise ValueError(text) from None
+    return found
+
+
+_API = read_header((importlib.resources.files(__name__) / "api.h").read_text(encoding="utf-8"))
 
 
 def wanted() -> str:
@@ -226,8 +243,8 @@ def render(
         OverflowError: If an image's light exceeds 2^28, whose square sums could overflow; scale it down.
     """
     cancelled, (channels, height, width) = ctypes.c_int32(0), surfaces[0][0].shape
-    scene = _TYPES["scene"](
-        *(height, width, channels, get_args(Kind).index(kind), len(surfaces), *_maps(surfaces), covered),
+    scene = _API.structures["scene"](
+        *(height, width, channels, _API.constants[kind.upper()], len(surfaces), *_maps(surfaces), covered),
         *(occlusion, normalize, masked, highlights, crisp_px, reach, *_of_layers(nodes, layers)),
         *(_field_masks(field_masks), field_masks[0][0].shape[1] if field_masks else 0, squeeze),
         *(_threads(), ctypes.pointer(cancelled)),
@@ -285,7 +302,7 @@ def _layers_of(
     channels, rows, columns = surfaces[0][0].shape
     size = (rows, columns, margin, *area, channels, len(surfaces))
     how = (occlusion, backed, *_of_layers(nodes, layers), _threads(), ctypes.pointer(ctypes.c_int32(0)))
-    return _TYPES["layers"](*size, *_maps(surfaces), *how)
+    return _API.structures["layers"](*size, *_maps(surfaces), *how)
 
 
 def _maps(surfaces: Sequence[Surface]) -> list[list[Tensor | None]]:
@@ -294,7 +311,7 @@ def _maps(surfaces: Sequence[Surface]) -> list[list[Tensor | None]]:
 
 
 def _of_layers(nodes: Sequence[float], layers: Sequence[tuple[Tensor, int]]) -> tuple[Any, ...]:
-    """Values of :data:`_LAYERS`."""
+    """Values of the fields of ``torchdof_scene`` from ``layers`` to ``kernels``."""
     kernels = [kernel.float() for kernel, _ in layers]
     colours = max(kernel.shape[0] for kernel in kernels)
     bank = torch.cat([kernel.expand(colours, -1, -1).flatten() for kernel in kernels])
@@ -303,7 +320,7 @@ def _of_layers(nodes: Sequence[float], layers: Sequence[tuple[Tensor, int]]) -> 
 
 
 def _field_masks(masks: Sequence[KernelMask]) -> list[Any] | None:
-    mask_of = _TYPES["field_mask"]
+    mask_of = _API.structures["field_mask"]
     return [mask_of(values, boxes, coc, len(values), *values.shape[2:]) for values, boxes, coc, _ in masks] or None
 
 
@@ -372,7 +389,9 @@ def look_behind_gradient(
 
 
 def _level_arguments(levels: Sequence[Tensor], rules: Rules, coc: Tensor, wanted: Tensor | None) -> tuple[Any, ...]:
-    each = [_TYPES["level"](values, *values.shape[1:], *rule) for values, rule in zip(levels, rules, strict=True)]
+    each = [
+        _API.structures["level"](values, *values.shape[1:], *rule) for values, rule in zip(levels, rules, strict=True)
+    ]
     return each, len(each), levels[0].shape[0] - 2, coc, wanted, *coc.shape[1:], _threads()
 
 
@@ -405,7 +424,7 @@ def repair_edges(light: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_c
     out, cancelled, changed = _empty(*nearness.shape), ctypes.c_int32(0), ctypes.c_int32(0)
     steps = (None, float(step)) if step.ndim == 0 else (step, 0.0)
     maps = (*nearness.shape, light.shape[0], light, nearness, of_coc, *steps)
-    scene = _TYPES["map"](*maps, auto, _threads(), ctypes.pointer(cancelled), out)
+    scene = _API.structures["map"](*maps, auto, _threads(), ctypes.pointer(cancelled), out)
     _interruptible(lambda: _run("repair_edges", scene, changed), cancelled, nearness.numel())
     return out if changed.value else nearness
 
@@ -444,7 +463,9 @@ def kernels(spots: Spots, *, squeeze: float, is_round: bool, is_even: bool) -> l
     cells = [template.shape[-1] // 2 - 1 for template in spots.templates]
     index, reach, fade = ([*itertools.chain(*each)] for each in (spots.which, spots.reach, spots.fade))
     numbers = (spots.part, spots.finer, reach, fade, spots.flipped, spots.half)
-    scene = _TYPES["spots"](len(made), colours, spots.templates, cells, index, *numbers, squeeze, is_round, is_even)
+    scene = _API.structures["spots"](
+        len(made), colours, spots.templates, cells, index, *numbers, squeeze, is_round, is_even
+    )
     _run("kernels", scene, _threads(), made)
     return made
 
@@ -455,7 +476,7 @@ def ends(values: Tensor) -> tuple[float, float]:
     PyTorch's own reduction would leave its threads spinning, which slows down the engine's threads.
     """
     low, high = ctypes.c_float(), ctypes.c_float()
-    _run("ends", values, values.numel(), _threads(), low, high)
+    _run("ends", values, values.numel(), _threads(), ctypes.byref(low), ctypes.byref(high))
     return low.value, high.value
 
 
@@ -497,11 +518,11 @@ def _run(name: str, *arguments: Any) -> None:
     """Calls a function of the engine, and raises the error that its status means."""
     function, kept = getattr(_engine(), f"torchdof_{name}"), _contiguous(arguments)
     status = function(*(_plain(kind, value) for kind, value in zip(function.argtypes, kept, strict=True)))
-    if status == _NO_MEMORY:
+    if status == _API.constants["NO_MEMORY"]:
         raise MemoryError("there is too little memory to render this image")
-    if status == _TOO_BRIGHT:
+    if status == _API.constants["TOO_BRIGHT"]:
         raise OverflowError("light beyond 2 to the 28th is too bright for float32")
-    if status == _CANCELLED:
+    if status == _API.constants["CANCELLED"]:
         raise KeyboardInterrupt
 
 
@@ -559,12 +580,11 @@ def _loaded(name: str) -> tuple[ctypes.CDLL | None, str]:
         if "failed to map segment" in str(error) and "permitted" not in str(error):  # a file system may also forbid it
             raise MemoryError("there is too little memory to load the compiled engine") from None
         return None, f"the compiled engine cannot be loaded: {error}"
-    scene, *others = (ctypes.sizeof(_TYPES[name]) for name in ("scene", "map", "layers", "level"))
     try:
-        for name, types in _FUNCTIONS.items():
+        for name, (result, arguments) in _API.functions.items():
             function = getattr(library, f"torchdof_{name}")
-            function.restype, *function.argtypes = map(_type, types.split())
-        is_current = library.torchdof_interface() == _REVISION << 32 | scene << 16 | sum(others)
+            function.restype, function.argtypes = result, arguments
+        is_current = library.torchdof_interface() == _API.checksum
     except AttributeError:  # an old build, left beside new sources
         is_current = False
     if is_current:

@@ -1,22 +1,38 @@
-// Blurs and composites the layers of a padded frame as composite.cpp does, forward and backward, for training. All planes
-// are dense, because every pixel has a gradient.
+// Blurs and composites the layers of a padded frame as composite.cpp does, forward and backward, for training. All
+// planes are dense, because every pixel has a gradient.
 //
 // With m a layer's share of each pixel, r the share behind it, I light and K the layer's kernel, from far to near:
 //
 //   l = K * (m I),  w = K * m,  v = K * r,   n = w + v' (v' is v, raised where w + v < KNOWN)
 //   picture = l / n + (1 - w / n) picture
 //
-// Between the focus and the layers before it, surfaces stand in for the background (stand_ins in render/surfaces/frame.py).
+// Between the focus and the layers before it, surfaces stand in for the background (stand_ins in
+// render/surfaces/frame.py).
 //
-// Backward, the blurred l, w and v are computed again and kept, block by block; their gradients replace them. Each block
-// then composites its layers again, walks back through them from near to far, and the gradients of l, w and v are
+// Backward, the blurred l, w and v are computed again and kept, block by block; their gradients replace them. Each
+// block then composites its layers again, walks back through them from near to far, and the gradients of l, w and v are
 // scattered by the turned kernels to the gradients of m I, m and r, and from these to the surfaces.
-#include "engine.h"
+#include <algorithm>
+#include <cstdint>
+#include <cstring>
+#include <vector>
+
+#include "api.h"
+#include "blocks.h"
+#include "blur_axis.h"
+#include "constants/native.h"
+#include "convolution.h"
+#include "entry.h"
+#include "layers.h"
+#include "memory.h"
 #include "rules.h"
+#include "simd.h"
+#include "threads.h"
 
 namespace torchdof {
 namespace {
 
+constexpr int MOST_PLANES = constants::native::MOST_PLANES;
 static_assert(BLOCK % STRIP_COLUMNS == 0 && BLOCK % STRIP_ROWS == 0, "strips fill a block");
 
 inline vec load_some(const float *p, int n) {
@@ -31,14 +47,14 @@ inline void add_some(float *p, vec v, int n) {
 }
 // Consecutive layers of one resolution on one side of the focus, on a grid of their pixels, the padded frame's.
 struct Run {
-  int scale, margin;                     // margin: pixels of the grid before the picture
-  int rows, columns, pitch;              // of the grid
-  int half;                              // largest half width of its kernels
+  int scale, margin;         // margin: pixels of the grid before the picture
+  int rows, columns, pitch;  // of the grid
+  int half;                  // largest half width of its kernels
   int block_rows, block_columns;
-  int top, left, bottom, right;          // its canvas in the grid; a coarse one has one more pixel on each side
-  std::vector<int> layers;               // far to near
-  size_t plane;                          // values of a plane of the grid
-  Buffer<float> canvas, slopes;          // light and coverage [planes, plane], and their gradient
+  int top, left, bottom, right;  // its canvas in the grid; a coarse one has one more pixel on each side
+  std::vector<int> layers;       // far to near
+  size_t plane;                  // values of a plane of the grid
+  Buffer<float> canvas, slopes;  // light and coverage [planes, plane], and their gradient
   size_t at(int y, int x) const { return (size_t)y * pitch + x; }
   int blocks() const { return block_rows * block_columns; }
 };
@@ -55,18 +71,20 @@ struct Tile {
 
 // A layer: which blocks of its run's grid its light reaches, and the blurred terms there.
 struct Blurred {
-  std::vector<int> index;   // of each block in `values`, or -1
-  std::vector<int> reached;  // blocks with blurred terms
-  std::vector<uint8_t> needed;  // blocks that are read for these
+  std::vector<int> index;                 // of each block in `values`, or -1
+  std::vector<int> reached;               // blocks with blurred terms
+  std::vector<uint8_t> needed;            // blocks that are read for these
   std::vector<uint8_t> occupied, behind;  // blocks in which the layer occurs; in which a surface lies behind it
-  Buffer<float> values;     // [blocks, terms, BLOCK_PIXELS]
-  std::vector<Kernel> kernels, turned;  // for each colour
+  Buffer<float> values;                   // [blocks, terms, BLOCK_PIXELS]
+  std::vector<Kernel> kernels, turned;    // for each colour
 };
 
 class Blend {
  public:
   explicit Blend(const torchdof_layers &scene)
-      : scene_(scene), C_(scene.channels), E_(scene.kernel_colours), S_(scene.surfaces), over_(scene.occlusion), terms_(C_ + (over_ ? 2 : 1)), values_(C_ + (over_ ? 2 : 1) * E_), planes_(C_ + E_), empty_(scene.backed ? 1.0f : 0.0f) {
+      : scene_(scene), C_(scene.channels), E_(scene.kernel_colours), S_(scene.surfaces), over_(scene.occlusion),
+        terms_(C_ + (over_ ? 2 : 1)), values_(C_ + (over_ ? 2 : 1) * E_), planes_(C_ + E_),
+        empty_(scene.backed ? 1.0f : 0.0f) {
     const float *values = scene.kernels;
     layers_.resize(scene.layers);
     blurred_.resize(scene.layers);
@@ -131,7 +149,9 @@ class Blend {
   };
   static constexpr Step STAND_INS = {nullptr, -1};
 
-  const Run &fine() const { return *std::find_if(runs_.begin(), runs_.end(), [](const Run &run) { return run.scale == 1; }); }
+  const Run &fine() const {
+    return *std::find_if(runs_.begin(), runs_.end(), [](const Run &run) { return run.scale == 1; });
+  }
 
   template <typename Body>
   void parallel(int count, const Body &body) const {
@@ -141,9 +161,11 @@ class Blend {
   template <typename Body>
   void each_block(const Run &run, const Body &body) {
     std::vector<Events> events(std::max(1, scene_.threads));
-    const int r0 = std::max(run.top, 0) / BLOCK, r1 = (run.bottom - 1) / BLOCK, c0 = std::max(run.left, 0) / BLOCK, c1 = (run.right - 1) / BLOCK;
+    const int r0 = std::max(run.top, 0) / BLOCK, r1 = (run.bottom - 1) / BLOCK, c0 = std::max(run.left, 0) / BLOCK,
+              c1 = (run.right - 1) / BLOCK;
     const int across = c1 - c0 + 1;
-    parallel((r1 - r0 + 1) * across, [&](int i, int worker) { body((r0 + i / across) * run.block_columns + c0 + i % across, events[worker]); });
+    parallel((r1 - r0 + 1) * across,
+             [&](int i, int worker) { body((r0 + i / across) * run.block_columns + c0 + i % across, events[worker]); });
   }
 
   Buffer<float> grid_planes(const Run &run, int count) const {
@@ -167,7 +189,9 @@ class Blend {
         composite(steps, block, canvas);
         const int y0 = block / run.block_columns * BLOCK, x0 = block % run.block_columns * BLOCK;
         for (int c = 0; c < planes_; c++)
-          for (int y = 0; y < BLOCK; y++) memcpy(run.canvas.data() + c * run.plane + run.at(y0 + y, x0), canvas + c * BLOCK_PIXELS + y * BLOCK, BLOCK * sizeof(float));
+          for (int y = 0; y < BLOCK; y++)
+            memcpy(run.canvas.data() + c * run.plane + run.at(y0 + y, x0), canvas + c * BLOCK_PIXELS + y * BLOCK,
+                   BLOCK * sizeof(float));
       });
     }
   }
@@ -188,7 +212,9 @@ class Blend {
       run.half = 0;
     };
     for (int k = scene_.layers - 1; k >= 0; k--) {
-      const bool follows = !runs_.empty() && runs_.back().scale == layers_[k].scale && (layers_[k].scale == 1 || (layers_[runs_.back().layers.back()].node < 0) == (layers_[k].node < 0));
+      const bool follows =
+          !runs_.empty() && runs_.back().scale == layers_[k].scale &&
+          (layers_[k].scale == 1 || (layers_[runs_.back().layers.back()].node < 0) == (layers_[k].node < 0));
       if (!follows) add(layers_[k].scale);
       runs_.back().layers.push_back(k);
       runs_.back().half = std::max(runs_.back().half, layers_[k].half);
@@ -282,8 +308,11 @@ class Blend {
       const bool outside = y0 >= run.bottom || y0 + BLOCK <= run.top || x0 >= run.right || x0 + BLOCK <= run.left;
       if (outside || !occurs(run, k, y0 - half, y0 + BLOCK + half, x0 - half, x0 + BLOCK + half)) continue;
       b.index[i] = reached++;
-      for (int r = std::max(y0 - half, 0) / BLOCK; r <= std::min((y0 + BLOCK - 1 + half) / BLOCK, run.block_rows - 1); r++)
-        for (int c = std::max(x0 - half, 0) / BLOCK; c <= std::min((x0 + BLOCK - 1 + half) / BLOCK, run.block_columns - 1); c++) b.needed[r * run.block_columns + c] = 1;
+      for (int r = std::max(y0 - half, 0) / BLOCK; r <= std::min((y0 + BLOCK - 1 + half) / BLOCK, run.block_rows - 1);
+           r++)
+        for (int c = std::max(x0 - half, 0) / BLOCK;
+             c <= std::min((x0 + BLOCK - 1 + half) / BLOCK, run.block_columns - 1); c++)
+          b.needed[r * run.block_columns + c] = 1;
     }
     b.values = Buffer<float>((size_t)reached * values_ * BLOCK_PIXELS + 1);
   }
@@ -296,8 +325,16 @@ class Blend {
     std::vector<std::vector<float>> memory(std::max(1, scene_.threads));
     parallel(down * across, [&](int i, int worker) {
       const int row0 = i / across * side, column0 = i % across * side, width = side * BLOCK + 2 * guard;
-      const Tile tile = {row0, std::min(row0 + side, run.block_rows), column0, std::min(column0 + side, run.block_columns),
-                         row0 * BLOCK - guard, column0 * BLOCK - guard, width, width, (size_t)width * width, memory[worker]};
+      const Tile tile = {row0,
+                         std::min(row0 + side, run.block_rows),
+                         column0,
+                         std::min(column0 + side, run.block_columns),
+                         row0 * BLOCK - guard,
+                         column0 * BLOCK - guard,
+                         width,
+                         width,
+                         (size_t)width * width,
+                         memory[worker]};
       tile.memory.resize(planes * tile.plane + LANES);
       for (int k : run.layers) body(k, tile);
     });
@@ -314,14 +351,16 @@ class Blend {
     return index < 0 ? nullptr : blurred_[k].values.data() + (size_t)index * values_ * BLOCK_PIXELS;
   }
 
-  vec weight_at(int j, size_t at, int n) const { return scene_.weight[j] ? load_some(scene_.weight[j] + at, n) : all(1.0f); }
+  vec weight_at(int j, size_t at, int n) const {
+    return scene_.weight[j] ? load_some(scene_.weight[j] + at, n) : broadcast(1.0f);
+  }
 
   // The surfaces of some pixels, near to far, in a layer.
   struct Pixels {
-    vec weight[2], counted[2];  // given; with the continuation of the farther surface
-    vec ahead[2], here[2];      // arguments of the ramps
-    vec h[2], t[2];             // share at or behind the layer; share behind it
-    vec extra = {};             // weight of the continuation
+    vec weight[2], counted[2];        // given; with the continuation of the farther surface
+    vec ahead[2], here[2];            // arguments of the ramps
+    vec h[2], t[2];                   // share at or behind the layer; share behind it
+    vec extra = {};                   // weight of the continuation
     decltype(vec{} < vec{}) swapped;  // the frame's second surface is the nearer one
   };
   // Surface j of the frame from the nearer and the farther one, or the other way round.
@@ -350,8 +389,8 @@ class Blend {
     p.counted[1] += p.extra * visible_part(p.h[0]);
   }
 
-  // Calls body(y, x, n, side, occupied) for up to LANES pixels of the padded frame at a time, for those cells of a range of
-  // pixels of a run's grid that are not wholly in front of a layer.
+  // Calls body(y, x, n, side, occupied) for up to LANES pixels of the padded frame at a time, for those cells of a
+  // range of pixels of a run's grid that are not wholly in front of a layer.
   template <typename Body>
   void each_cell(const Run &run, int k, int y0, int y1, int x0, int x1, const Body &body) const {
     const int s = run.scale, bottom = std::min(y1 * s, scene_.rows), right = std::min(x1 * s, scene_.columns);
@@ -362,7 +401,8 @@ class Blend {
         if (side == IN_FRONT || (side == BEHIND && !over_)) continue;
         const bool occupied = is_in(k, cell);
         for (int y = top; y < std::min(top + CELL, bottom); y++)
-          for (int x = left; x < std::min(left + CELL, right); x += LANES) body(y, x, std::min(LANES, scene_.columns - x), side, occupied);
+          for (int x = left; x < std::min(left + CELL, right); x += LANES)
+            body(y, x, std::min(LANES, scene_.columns - x), side, occupied);
       }
   }
 
@@ -373,7 +413,8 @@ class Blend {
     const Layer &l = layers_[k];
     const float part = 1.0f / (s * s);
     std::fill(tile.memory.begin(), tile.memory.end(), 0.0f);
-    const int top = tile.row0 * BLOCK - guard, bottom = tile.row1 * BLOCK + guard, left = tile.column0 * BLOCK - guard, right = tile.column1 * BLOCK + guard;
+    const int top = tile.row0 * BLOCK - guard, bottom = tile.row1 * BLOCK + guard, left = tile.column0 * BLOCK - guard,
+              right = tile.column1 * BLOCK + guard;
     each_cell(run, k, top, bottom, left, right, [&](int y, int x, int n, Side side, bool occupied) {
       const size_t at = (size_t)y * scene_.columns + x;
       float *its = tile.at(0, y / s, x / s);
@@ -382,7 +423,7 @@ class Blend {
         if (s == 1)
           n == LANES ? store(to, term) : add_some(to, term, n);
         else if (s >= LANES)
-          to[0] += part * sum(term);
+          to[0] += part * reduce_add(term);
         else
           for (int i = 0; i < n; i++) to[i / s] += part * term[i];
       };
@@ -409,26 +450,31 @@ class Blend {
 
   // Rows of a block's window that contain a layer, or surfaces behind it, as column marks for convolve_strip.
   void rows_of(const Run &run, int k, int block, bool behind, std::vector<uint32_t> &rows) const {
-    const int half = layers_[k].half, y0 = block / run.block_columns * BLOCK - half, x0 = block % run.block_columns * BLOCK - half;
+    const int half = layers_[k].half, y0 = block / run.block_columns * BLOCK - half,
+              x0 = block % run.block_columns * BLOCK - half;
     rows.assign(BLOCK + 2 * half, 0);
     const int step = std::max(CELL / run.scale, 1);  // rows of a cell
     for (int i = 0, next; i < (int)rows.size(); i = next) {
       next = std::min((floor_div(y0 + i, step) + 1) * step - y0, (int)rows.size());
       const int x1 = x0 + BLOCK + 2 * half;
-      const bool any = behind ? reaches_behind(run, k, y0 + i, y0 + next, x0, x1) : occurs(run, k, y0 + i, y0 + next, x0, x1);
+      const bool any =
+          behind ? reaches_behind(run, k, y0 + i, y0 + next, x0, x1) : occurs(run, k, y0 + i, y0 + next, x0, x1);
       std::fill(rows.begin() + i, rows.begin() + next, any ? ~0u : 0u);
     }
   }
 
   // Convolves a block of a plane: out [BLOCK, BLOCK]. Strips of rows y for which `wanted(y)` is false stay unwritten.
   template <typename Wanted>
-  void convolve(const Run &run, const Tile &tile, int plane, int block, const Kernel &kernel, const uint32_t *rows, float *out, const Wanted &wanted) const {
+  void convolve(const Run &run, const Tile &tile, int plane, int block, const Kernel &kernel, const uint32_t *rows,
+                float *out, const Wanted &wanted) const {
     const int y0 = block / run.block_columns * BLOCK, x0 = block % run.block_columns * BLOCK;
     float strip[STRIP];
     for (int y = 0; y < BLOCK; y += STRIP_ROWS)
       for (int x = 0; wanted(y) && x < BLOCK; x += STRIP_COLUMNS) {
-        convolve_strip(tile.at(plane, y0 + y - kernel.half, x0 + x - kernel.half), tile.columns, rows + y, ~0u, kernel, strip);
-        for (int i = 0; i < STRIP_ROWS; i++) memcpy(out + (y + i) * BLOCK + x, strip + i * STRIP_COLUMNS, STRIP_COLUMNS * sizeof(float));
+        convolve_strip(tile.at(plane, y0 + y - kernel.half, x0 + x - kernel.half), tile.columns, rows + y, ~0u, kernel,
+                       strip);
+        for (int i = 0; i < STRIP_ROWS; i++)
+          memcpy(out + (y + i) * BLOCK + x, strip + i * STRIP_COLUMNS, STRIP_COLUMNS * sizeof(float));
       }
   }
 
@@ -446,7 +492,11 @@ class Blend {
       rows_of(run, k, block, true, rows_behind);
       for (int v = 0; v < values_; v++, to += BLOCK_PIXELS) {
         const int term = v < C_ + E_ ? std::min(v, C_) : C_ + 1;
-        convolve(run, tile, term, block, b.kernels[E_ == 1 ? 0 : v < C_ ? v : (v - C_) % E_], term <= C_ ? rows.data() : rows_behind.data(), to, [](int) { return true; });
+        convolve(run, tile, term, block,
+                 b.kernels[E_ == 1  ? 0
+                           : v < C_ ? v
+                                    : (v - C_) % E_],
+                 term <= C_ ? rows.data() : rows_behind.data(), to, [](int) { return true; });
       }
     });
   }
@@ -459,7 +509,7 @@ class Blend {
   struct Front {
     vec share, transmittance;  // of a layer in a pixel; for the light behind it
   };
-  Front front(vec share) const { return {share, scene_.backed ? share : most(all(1.0f) - share, vec{})}; }
+  Front front(vec share) const { return {share, scene_.backed ? share : max(1.0f - share, vec{})}; }
   struct Normalizer {
     vec lacking, behind, sum;  // what the sum lacks to KNOWN; the share behind the layer, raised; their sum
   };
@@ -480,7 +530,8 @@ class Blend {
     store(to, (scene_.backed ? vec{} : f.share) + f.transmittance * load<vec>(to));
   }
   void add(const float *values, float *canvas) const {
-    for (int i = 0; i < planes_ * BLOCK_PIXELS; i += LANES) store(canvas + i, load<vec>(canvas + i) + load<vec>(values + i));
+    for (int i = 0; i < planes_ * BLOCK_PIXELS; i += LANES)
+      store(canvas + i, load<vec>(canvas + i) + load<vec>(values + i));
   }
   // Calls body(e, i) for each vector of pixels of a block and each of the kernel's colours.
   template <typename Body>
@@ -511,7 +562,9 @@ class Blend {
   }
   // Puts a step in front of a canvas; returns false if it is empty there. `kept`: takes a coarse canvas, interpolated.
   bool put(const Step &step, int block, float *canvas, float *kept) const {
-    return step.run ? join(*step.run, block, canvas, kept) : step.layer < 0 ? put_stand_ins(block, canvas) : put_layer(step.layer, block, canvas);
+    return step.run         ? join(*step.run, block, canvas, kept)
+           : step.layer < 0 ? put_stand_ins(block, canvas)
+                            : put_layer(step.layer, block, canvas);
   }
   void composite(const std::vector<Step> &steps, int block, float *canvas) const {
     float kept[MOST * BLOCK_PIXELS];
@@ -529,7 +582,7 @@ class Blend {
     each_pixel([&](int e, int i) {
       const vec own = load<vec>(values + (C_ + e) * BLOCK_PIXELS + i);
       const Normalizer n = normalizer_of(own, load<vec>(values + (C_ + E_ + e) * BLOCK_PIXELS + i));
-      const vec per = all(1.0f) / n.sum;
+      const vec per = 1.0f / n.sum;
       over(e, i, front((scene_.backed ? n.behind : own) * per), values, per, canvas);
     });
     return true;
@@ -553,9 +606,9 @@ class Blend {
     }
     return s;
   }
-  vec alone(const StandIns &s, int j) const { return S_ > 1 ? s.missing[1 - j] : all(1.0f); }
-  // Calls body(i, at, n, stand_ins) for up to LANES pixels at a time, i in a block of the picture and `at` in the padded
-  // frame, where any surface stands in.
+  vec alone(const StandIns &s, int j) const { return S_ > 1 ? s.missing[1 - j] : broadcast(1.0f); }
+  // Calls body(i, at, n, stand_ins) for up to LANES pixels at a time, i in a block of the picture and `at` in the
+  // padded frame, where any surface stands in.
   template <typename Body>
   void each_stand_in(int block, const Body &body) const {
     const int y0 = block / fine().block_columns * BLOCK, x0 = block % fine().block_columns * BLOCK;
@@ -567,7 +620,7 @@ class Blend {
         if (any_positive(s.sum)) body(y * BLOCK + x, at, n, s);
       }
   }
-  Front front_of(const StandIns &s) const { return front(scene_.backed ? all(1.0f) - s.sum : s.sum); }
+  Front front_of(const StandIns &s) const { return front(scene_.backed ? 1.0f - s.sum : s.sum); }
   bool put_stand_ins(int block, float *canvas) const {
     bool any = false;
     float light[MOST * BLOCK_PIXELS];
@@ -578,33 +631,33 @@ class Blend {
         for (int j = 0; j < S_; j++) sum += s.cover[j] * load_some(scene_.light[j] + c * map_ + at, n);
         store(light + c * BLOCK_PIXELS + i, sum);
       }
-      for (int e = 0; e < E_; e++) over(e, i, front_of(s), light, all(1.0f), canvas);
+      for (int e = 0; e < E_; e++) over(e, i, front_of(s), light, broadcast(1.0f), canvas);
     });
     return any;
   }
   // Walks back through the stand-ins, to the gradients of the surfaces.
   void walk_stand_ins(int block, const float *behind, float *slopes) const {
     each_stand_in(block, [&](int i, size_t at, int n, const StandIns &s) {
-      vec of_sum = {}, of_cover[2] = {}, of_weight[2] = {}, of_place[2] = {};
+      vec d_sum = {}, d_cover[2] = {}, d_weight[2] = {}, d_place[2] = {};
       for (int e = 0; e < E_; e++)
-        of_sum += through(e, i, front_of(s), behind, slopes, [&](int c, vec slope) {
+        d_sum += through(e, i, front_of(s), behind, slopes, [&](int c, vec slope) {
           for (int j = 0; j < S_; j++) {
-            of_cover[j] += slope * load_some(scene_.light[j] + c * map_ + at, n);
+            d_cover[j] += slope * load_some(scene_.light[j] + c * map_ + at, n);
             add_some(light_[j] + c * map_ + at, slope * s.cover[j], n);
           }
         });
       for (int j = 0; j < S_; j++) {
-        of_cover[j] += scene_.backed ? -of_sum : of_sum;
-        of_weight[j] += of_cover[j] * slope_of_seen(s.weight[j]) * stands_in(s.place[j]) * alone(s, j);
-        of_place[j] += of_cover[j] * seen(s.weight[j]) * slope_of_stands_in(s.place[j]) * alone(s, j);
+        d_cover[j] += scene_.backed ? -d_sum : d_sum;
+        d_weight[j] += d_cover[j] * slope_of_seen(s.weight[j]) * stands_in(s.place[j]) * alone(s, j);
+        d_place[j] += d_cover[j] * seen(s.weight[j]) * slope_of_stands_in(s.place[j]) * alone(s, j);
         if (S_ == 1) continue;
-        const vec of_missing = of_cover[j] * seen(s.weight[j]) * stands_in(s.place[j]);
-        of_weight[1 - j] -= of_missing * slope_of_counts(s.weight[1 - j]) * at_focus(s.place[1 - j]);
-        of_place[1 - j] -= of_missing * counts(s.weight[1 - j]) * slope_of_at_focus(s.place[1 - j]);
+        const vec d_missing = d_cover[j] * seen(s.weight[j]) * stands_in(s.place[j]);
+        d_weight[1 - j] -= d_missing * slope_of_counts(s.weight[1 - j]) * at_focus(s.place[1 - j]);
+        d_place[1 - j] -= d_missing * counts(s.weight[1 - j]) * slope_of_at_focus(s.place[1 - j]);
       }
       for (int j = 0; j < S_; j++) {
-        add_some(place_[j] + at, of_place[j], n);
-        if (scene_.weight[j]) add_some(weight_[j] + at, of_weight[j], n);
+        add_some(place_[j] + at, d_place[j], n);
+        if (scene_.weight[j]) add_some(weight_[j] + at, d_weight[j], n);
       }
     });
   }
@@ -656,7 +709,8 @@ class Blend {
   }
   // The gradient of a coarse canvas at a block of its grid, from that of its interpolation: [planes, BLOCK, BLOCK].
   void gather(const Run &run, int block, float *slopes) const {
-    const int s = run.scale, y0 = block / run.block_columns * BLOCK - run.top, x0 = block % run.block_columns * BLOCK - run.left;
+    const int s = run.scale, y0 = block / run.block_columns * BLOCK - run.top,
+              x0 = block % run.block_columns * BLOCK - run.left;
     const int H = scene_.height, W = scene_.width, rows = run.bottom - run.top, columns = run.right - run.left;
     auto weight = [&](int at, int i, int limit) {
       int before;
@@ -680,7 +734,8 @@ class Blend {
         }
         for (int x = std::max(0, -x0); x < BLOCK && x0 + x < columns; x++) {
           float total = 0;
-          for (int from = low(x0 + x); from < high(x0 + x, W); from++) total += weight(from, x0 + x, columns) * line[from];
+          for (int from = low(x0 + x); from < high(x0 + x, W); from++)
+            total += weight(from, x0 + x, columns) * line[from];
           slopes[c * BLOCK_PIXELS + y * BLOCK + x] = total;
         }
       }
@@ -689,7 +744,9 @@ class Blend {
   bool join(const Run &run, int block, float *canvas, float *values) const {
     if (!widen(run, block, values)) return false;
     if (over_)
-      each_pixel([&](int e, int i) { over(e, i, front(load<vec>(values + (C_ + e) * BLOCK_PIXELS + i)), values, all(1.0f), canvas); });
+      each_pixel([&](int e, int i) {
+        over(e, i, front(load<vec>(values + (C_ + e) * BLOCK_PIXELS + i)), values, broadcast(1.0f), canvas);
+      });
     else
       add(values, canvas);
     return true;
@@ -703,33 +760,35 @@ class Blend {
     const int left = std::max(run.left - x0, 0), count = std::min(run.right - x0, BLOCK) - left;
     for (int c = 0; c < planes_; c++)
       for (int y = std::max(run.top - y0, 0); y < std::min(run.bottom - y0, BLOCK); y++)
-        body(c * BLOCK_PIXELS + y * BLOCK + left, ((size_t)c * scene_.height + y0 + y - run.top) * scene_.width + x0 + left - run.left, count);
+        body(c * BLOCK_PIXELS + y * BLOCK + left,
+             ((size_t)c * scene_.height + y0 + y - run.top) * scene_.width + x0 + left - run.left, count);
   }
   void write(int block, const float *canvas, float *out) const {
     each_row(block, [&](size_t from, size_t to, int count) { memcpy(out + to, canvas + from, count * sizeof(float)); });
   }
   void read(int block, const float *picture, float *canvas) const {
     memset(canvas, 0, planes_ * BLOCK_PIXELS * sizeof(float));
-    each_row(block, [&](size_t to, size_t from, int count) { memcpy(canvas + to, picture + from, count * sizeof(float)); });
+    each_row(block,
+             [&](size_t to, size_t from, int count) { memcpy(canvas + to, picture + from, count * sizeof(float)); });
   }
 
-  // One step back through the composite at pixel i, for kernel e. Multiplies the gradients by the transmittance, so that
-  // they become those of the picture behind. Calls light(c, slope) with the gradient of the front's light in each
+  // One step back through the composite at pixel i, for kernel e. Multiplies the gradients by the transmittance, so
+  // that they become those of the picture behind. Calls light(c, slope) with the gradient of the front's light in each
   // channel; returns the gradient of the front's share.
   template <typename Light>
   vec through(int e, int i, Front f, const float *behind, float *slopes, const Light &light) const {
     float *coverage = slopes + (C_ + e) * BLOCK_PIXELS + i;
-    const vec of_coverage = load<vec>(coverage);
-    vec of_transmittance = of_coverage * load<vec>(behind + (C_ + e) * BLOCK_PIXELS + i);
+    const vec d_coverage = load<vec>(coverage);
+    vec d_transmittance = d_coverage * load<vec>(behind + (C_ + e) * BLOCK_PIXELS + i);
     for (int c = first_channel(e); c <= last_channel(e); c++) {
       float *its = slopes + c * BLOCK_PIXELS + i;
       const vec slope = load<vec>(its);
-      of_transmittance += slope * load<vec>(behind + c * BLOCK_PIXELS + i);
+      d_transmittance += slope * load<vec>(behind + c * BLOCK_PIXELS + i);
       light(c, slope);
       store(its, f.transmittance * slope);
     }
-    store(coverage, f.transmittance * of_coverage);
-    return scene_.backed ? of_transmittance : of_coverage - (f.share <= all(1.0f) ? of_transmittance : vec{});
+    store(coverage, f.transmittance * d_coverage);
+    return scene_.backed ? d_transmittance : d_coverage - (f.share <= 1.0f ? d_transmittance : vec{});
   }
 
   // Walks back through a layer: its blurred terms become their gradients.
@@ -742,18 +801,19 @@ class Blend {
     each_pixel([&](int e, int i) {
       float *own = values + (C_ + e) * BLOCK_PIXELS + i, *behind_it = values + (C_ + E_ + e) * BLOCK_PIXELS + i;
       const Normalizer n = normalizer_of(load<vec>(own), load<vec>(behind_it));
-      const vec per = all(1.0f) / n.sum, share = (scene_.backed ? n.behind : load<vec>(own)) * per;
-      vec of_sum = {};
-      const vec of_share = through(e, i, front(share), behind, slopes, [&](int c, vec slope) {
+      const vec per = 1.0f / n.sum, share = (scene_.backed ? n.behind : load<vec>(own)) * per;
+      vec d_sum = {};
+      const vec d_share = through(e, i, front(share), behind, slopes, [&](int c, vec slope) {
         float *its = values + c * BLOCK_PIXELS + i;
-        const vec of_light = slope * per;
-        of_sum -= of_light * load<vec>(its) * per;
-        store(its, of_light);
+        const vec d_light = slope * per;
+        d_sum -= d_light * load<vec>(its) * per;
+        store(its, d_light);
       });
-      of_sum -= of_share * share * per;
-      const vec of_part = of_share * per, of_raised = of_sum + (scene_.backed ? of_part : vec{}), slope = slope_of_raise(n.lacking);
-      store(own, of_sum + (scene_.backed ? vec{} : of_part) + of_raised * slope);
-      store(behind_it, of_raised * (1.0f + slope));
+      d_sum -= d_share * share * per;
+      const vec d_part = d_share * per, d_raised = d_sum + (scene_.backed ? d_part : vec{}),
+                slope = slope_of_raise(n.lacking);
+      store(own, d_sum + (scene_.backed ? vec{} : d_part) + d_raised * slope);
+      store(behind_it, d_raised * (1.0f + slope));
     });
   }
 
@@ -781,15 +841,16 @@ class Blend {
     }
   }
   void walk_join(const Run &run, int block, const float *behind, const float *values, float *slopes) const {
-    float of_run[MOST * BLOCK_PIXELS];
+    float d_run[MOST * BLOCK_PIXELS];
     if (over_)
       each_pixel([&](int e, int i) {
         const Front f = front(load<vec>(values + (C_ + e) * BLOCK_PIXELS + i));
-        store(of_run + (C_ + e) * BLOCK_PIXELS + i, through(e, i, f, behind, slopes, [&](int c, vec slope) { store(of_run + c * BLOCK_PIXELS + i, slope); }));
+        store(d_run + (C_ + e) * BLOCK_PIXELS + i,
+              through(e, i, f, behind, slopes, [&](int c, vec slope) { store(d_run + c * BLOCK_PIXELS + i, slope); }));
       });
     else
-      memcpy(of_run, slopes, planes_ * BLOCK_PIXELS * sizeof(float));
-    write(block, of_run, run.slopes.data());
+      memcpy(d_run, slopes, planes_ * BLOCK_PIXELS * sizeof(float));
+    write(block, d_run, run.slopes.data());
   }
 
   // Scatters the gradients of a layer's blurred terms to its terms, and on to the surfaces.
@@ -802,7 +863,8 @@ class Blend {
     bool any = false;
     each_block_of(run, tile, [&](int block) { any |= has_gradient(block); });
     if (!any) return;
-    const int top = tile.row0 * BLOCK - half, bottom = tile.row1 * BLOCK + half, left = tile.column0 * BLOCK - half, right = tile.column1 * BLOCK + half;
+    const int top = tile.row0 * BLOCK - half, bottom = tile.row1 * BLOCK + half, left = tile.column0 * BLOCK - half,
+              right = tile.column1 * BLOCK + half;
     for (int r = floor_div(top, BLOCK); r * BLOCK < bottom; r++)
       for (int c = floor_div(left, BLOCK); c * BLOCK < right; c++) {
         const bool within = r >= 0 && r < run.block_rows && c >= 0 && c < run.block_columns;
@@ -811,7 +873,8 @@ class Blend {
         for (int v = 0; v < values_; v++)
           for (int y = std::max(top, r * BLOCK); y < std::min(bottom, (r + 1) * BLOCK); y++)
             if (values)
-              memcpy(tile.at(v, y, x0), values + v * BLOCK_PIXELS + (y - r * BLOCK) * BLOCK + x0 - c * BLOCK, count * sizeof(float));
+              memcpy(tile.at(v, y, x0), values + v * BLOCK_PIXELS + (y - r * BLOCK) * BLOCK + x0 - c * BLOCK,
+                     count * sizeof(float));
             else
               memset(tile.at(v, y, x0), 0, count * sizeof(float));
       }
@@ -830,7 +893,8 @@ class Blend {
         const int first = term < C_ ? term : term == C_ ? C_ : C_ + E_, count = term < C_ ? 1 : E_;
         for (int e = 0; e < count; e++) {
           const Kernel &kernel = b.turned[E_ == 1 ? 0 : term < C_ ? term : e];
-          convolve(run, tile, first + e, block, kernel, every.data(), e ? more : to, [&](int y) { return wanted[term > C_][y / STRIP_ROWS]; });
+          convolve(run, tile, first + e, block, kernel, every.data(), e ? more : to,
+                   [&](int y) { return wanted[term > C_][y / STRIP_ROWS]; });
           for (int j = 0; e && j < BLOCK_PIXELS; j++) to[j] += more[j];
         }
       }
@@ -861,44 +925,45 @@ class Blend {
         for (int i = 0; i < LANES; i++) wide[i] = from[(x + i) / s];
         return wide * part;
       };
-      const vec of_behind = over_ ? slope(C + 1) : vec{};
+      const vec d_behind = over_ ? slope(C + 1) : vec{};
       if (side == BEHIND) {
         for (int j = 0; j < S; j++)
-          if (scene_.weight[j]) add_some(weight_[j] + at, of_behind, n);
+          if (scene_.weight[j]) add_some(weight_[j] + at, d_behind, n);
         return;
       }
       Pixels p;
       weigh<S>(l, at, n, p);
-      vec of_counted[2], of_h[2] = {}, of_t[2] = {};
-      for (int j = 0; j < S; j++) of_counted[j] = of_behind * p.t[j];
+      vec d_counted[2], d_h[2] = {}, d_t[2] = {};
+      for (int j = 0; j < S; j++) d_counted[j] = d_behind * p.t[j];
       if (occupied) {
         vec share[2], given[2], more[2] = {};
         for (int j = 0; j < S; j++) share[j] = (p.h[j] - p.t[j]) * p.counted[j];
         for (int j = 0; j < S; j++) given[j] = swap<S>(p, share, j);
         for (int c = 0; c < C; c++) {
-          const vec of_light = slope(c);
+          const vec d_light = slope(c);
           for (int j = 0; j < S; j++) {
-            more[j] += of_light * load_some(scene_.light[j] + c * map_ + at, n);
-            add_some(light_[j] + c * map_ + at, of_light * given[j], n);
+            more[j] += d_light * load_some(scene_.light[j] + c * map_ + at, n);
+            add_some(light_[j] + c * map_ + at, d_light * given[j], n);
           }
         }
         for (int j = 0; j < S; j++) {
-          const vec of_share = slope(C) + swap<S>(p, more, j);
-          of_counted[j] += of_share * (p.h[j] - p.t[j]);
-          of_h[j] = of_share * p.counted[j];
-          of_t[j] = (of_behind - of_share) * p.counted[j];
+          const vec d_share = slope(C) + swap<S>(p, more, j);
+          d_counted[j] += d_share * (p.h[j] - p.t[j]);
+          d_h[j] = d_share * p.counted[j];
+          d_t[j] = (d_behind - d_share) * p.counted[j];
         }
       }
       if (S > 1) {
-        of_h[0] += of_counted[1] * p.extra * slope_of_visible_part(p.h[0]);
-        of_counted[1] *= 1.0f + slope_of_continuation(p.weight[1]) * visible_part(p.h[0]);
+        d_h[0] += d_counted[1] * p.extra * slope_of_visible_part(p.h[0]);
+        d_counted[1] *= 1.0f + slope_of_continuation(p.weight[1]) * visible_part(p.h[0]);
       }
-      vec of_place[2];
+      vec d_place[2];
       for (int j = 0; j < S; j++)
-        of_place[j] = of_h[j] * slope_of_ramp(p.ahead[j], over_) * l.per_before + of_t[j] * slope_of_ramp(p.here[j], over_) * l.per_after;
+        d_place[j] = d_h[j] * slope_of_ramp(p.ahead[j], over_) * l.per_before +
+                     d_t[j] * slope_of_ramp(p.here[j], over_) * l.per_after;
       for (int j = 0; j < S; j++) {
-        add_some(place_[j] + at, swap<S>(p, of_place, j), n);
-        if (scene_.weight[j]) add_some(weight_[j] + at, swap<S>(p, of_counted, j), n);
+        add_some(place_[j] + at, swap<S>(p, d_place, j), n);
+        if (scene_.weight[j]) add_some(weight_[j] + at, swap<S>(p, d_counted, j), n);
       }
     });
   }
@@ -921,10 +986,10 @@ class Blend {
 }  // namespace
 }  // namespace torchdof
 
-int32_t torchdof_blend(const torchdof_layers *layers, float *out, const float *gradient, float *const *of_light,
-                       float *const *of_place, float *const *of_weight) {
+int32_t torchdof_blend(const torchdof_layers *layers, float *out, const float *gradient, float *const *d_light,
+                       float *const *d_place, float *const *d_weight) {
   return torchdof::guarded([&] {
     torchdof::Blend blend(*layers);
-    gradient ? blend.gradient(gradient, of_light, of_place, of_weight) : blend.picture(out);
+    gradient ? blend.gradient(gradient, d_light, d_place, d_weight) : blend.picture(out);
   });
 }

@@ -1,12 +1,25 @@
 // Estimates the light beyond the frame's border, as described in render/surfaces/border.py.
-#include "engine.h"
+#include "border.h"
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <vector>
+
+#include "blur_axis.h"
+#include "highlights.h"
+#include "job.h"
+#include "numbers.h"
+#include "simd.h"
 
 namespace torchdof {
 
 constexpr double STEP = constants::border::STEP;
 
 // The part of a difference on the blur axis that is a step between surfaces; 0 for a slope. Below, its derivative.
-static double step_of(double difference) { return difference * std::clamp(std::fabs(difference) / STEP - 1.0, 0.0, 1.0); }
+static double step_of(double difference) {
+  return difference * std::clamp(std::fabs(difference) / STEP - 1.0, 0.0, 1.0);
+}
 static double slope_of_step(double difference) {
   const double steps = std::fabs(difference) / STEP;
   return steps < 1.0 ? 0.0 : steps > 2.0 ? 1.0 : 2.0 * steps - 1.0;
@@ -23,7 +36,7 @@ WindowSums::WindowSums(int length, int count, const double *values, const double
     bin_[at] = std::min((int)places[at], BINS - 2);
     part_[at] = places[at] - bin_[at];
     // shares of the pixel in each bin and all farther ones
-    const bins shares = least(most(places[at] - before, bins{}), bins{} + 1.0);
+    const bins shares = min(max(places[at] - before, bins{}), bins{} + 1.0);
     for (int n = 0; n < count; n++, until += BINS) store(until + count * BINS, load<bins>(until) + shares * *values++);
   }
 }
@@ -33,7 +46,8 @@ void WindowSums::sum(int level, double *sums, double *slopes) const {
   for (int at = 0, i = 0; at < length_; at++) {
     const double *from = &until_[(size_t)std::max(at - half, 0) * count_ * BINS];
     const double *to = &until_[(size_t)std::min(at + half + 1, length_) * count_ * BINS];
-    const int bin = bin_[at], before = std::max(bin - (part_[at] == 0), 0);  // a place at a bin has slopes to both sides
+    const int bin = bin_[at],
+              before = std::max(bin - (part_[at] == 0), 0);  // a place at a bin has slopes to both sides
     for (int n = 0; n < count_; n++, i++, from += BINS, to += BINS) {
       const double lower = to[bin] - from[bin], upper = to[bin + 1] - from[bin + 1];
       sums[i] = (1.0 - part_[at]) * lower + part_[at] * upper;
@@ -56,28 +70,29 @@ void BorderLine::find_places() {
   const auto ends = std::minmax_element(surface.begin(), surface.end());
   least = *ends.first, most = *ends.second, per_bin = (WindowSums::BINS - 1) / std::max(most - least, 1.0);
   for (size_t at = 0; at < x.size(); at++)
-    places[at] = std::clamp((surface[at] + step_of(x[at] - image_x[at]) - least) * per_bin, 0.0, WindowSums::BINS - 1.0);
+    places[at] =
+        std::clamp((surface[at] + step_of(x[at] - image_x[at]) - least) * per_bin, 0.0, WindowSums::BINS - 1.0);
 }
 
-void BorderLine::gradient(const double *of_places, ptrdiff_t step, float *of_x, float *of_image_x) const {
-  std::vector<double> of_surface(x.size());
-  double of_least = 0, of_most = 0, of_next = 0;
+void BorderLine::gradient(const double *d_places, ptrdiff_t step, float *d_x, float *d_image_x) const {
+  std::vector<double> d_surface(x.size());
+  double d_least = 0, d_most = 0, d_next = 0;
   for (size_t at = 0; at < x.size(); at++) {
     const double own = x[at] - image_x[at], place = (surface[at] + step_of(own) - least) * per_bin;
-    of_surface[at] = place < 0 || place > WindowSums::BINS - 1 ? 0.0 : of_places[at] * per_bin;
-    of_least -= of_surface[at];
-    if (most - least >= 1) of_most -= of_surface[at] * place / (WindowSums::BINS - 1);
-    of_x[at * step] += of_surface[at] * slope_of_step(own);
-    of_image_x[at * step] -= of_surface[at] * slope_of_step(own);
+    d_surface[at] = place < 0 || place > WindowSums::BINS - 1 ? 0.0 : d_places[at] * per_bin;
+    d_least -= d_surface[at];
+    if (most - least >= 1) d_most -= d_surface[at] * place / (WindowSums::BINS - 1);
+    d_x[at * step] += d_surface[at] * slope_of_step(own);
+    d_image_x[at * step] -= d_surface[at] * slope_of_step(own);
   }
   // pixels of equal extremes share their gradient
-  of_least = (of_least - of_most) / std::count(surface.begin(), surface.end(), least);
-  of_most /= std::count(surface.begin(), surface.end(), most);
+  d_least = (d_least - d_most) / std::count(surface.begin(), surface.end(), least);
+  d_most /= std::count(surface.begin(), surface.end(), most);
   for (size_t at = x.size() - 1; at > 0; at--) {
-    of_next += of_surface[at] + (surface[at] == least) * of_least + (surface[at] == most) * of_most;
-    const double slope = of_next * slope_of_step(image_x[at] - image_x[at - 1]);
-    of_image_x[at * step] += slope;
-    of_image_x[(at - 1) * step] -= slope;
+    d_next += d_surface[at] + (surface[at] == least) * d_least + (surface[at] == most) * d_most;
+    const double slope = d_next * slope_of_step(image_x[at] - image_x[at - 1]);
+    d_image_x[at * step] += slope;
+    d_image_x[(at - 1) * step] -= slope;
   }
 }
 
@@ -103,7 +118,8 @@ void Border::set(Side side, int surface, const BorderLine &line) {
     windows.sum(level, sum.data());
     for (int at = 0; at < length(side); at++) {
       const double *of = &sum[(size_t)at * sums], total = of[channels_];
-      for (int c = 0; c < channels_; c++) means_[side][start(side, surface, c, level) + at] = total > 0 ? (float)(of[c] / total) : 0.0f;
+      for (int c = 0; c < channels_; c++)
+        means_[side][start(side, surface, c, level) + at] = total > 0 ? (float)(of[c] / total) : 0.0f;
     }
   }
 }
@@ -146,7 +162,8 @@ void Border::continue_row(int surface, int channel, int y, int x, int n, float *
   const int far = y < 0 ? -y : y - height_ + 1;
   const float part = part_of_[far];
   const Side side = y < 0 ? TOP : BOTTOM;
-  const float *nearer = means_[side].data() + start(side, surface, channel, level_of_[far]) + x, *farther = nearer + length(side);
+  const float *nearer = means_[side].data() + start(side, surface, channel, level_of_[far]) + x,
+              *farther = nearer + length(side);
   const float *share = shares_[side].data() + (size_t)surface * length(side) + x;
   for (int i = 0; i < n; i++) row[i] = 0.5f * (row[i] * share[i] + nearer[i] + part * (farther[i] - nearer[i]));
 }

@@ -1,12 +1,31 @@
-// Composites the layers from far to near, as described in render/layers/composite.py. With m a layer's share of each pixel and
-// M the share at or behind the layer (its normalizer), K its kernel and I its light:
+// Composites the layers from far to near, as described in render/layers/composite.py. With m a layer's share of each
+// pixel and M the share at or behind the layer (its normalizer), K its kernel and I its light:
 //
 //   colour = K * (m I) / K * M,   coverage = K * m / K * M,   picture = colour + (1 - coverage) picture
 //
 // Runs of layers of a coarser resolution are composited first, each on a canvas of its own resolution. Then each tile
 // composites its full-resolution layers and these canvases while it is in the cache.
-#include "engine.h"
+#include "composite.h"
+
+#include <algorithm>
+#include <cstdint>
+#include <cstring>
+#include <memory>
+#include <vector>
+
+#include "blocks.h"
+#include "border.h"
+#include "constants/composite.h"
+#include "convolution.h"
+#include "disocclusion.h"
+#include "downsampling.h"
+#include "field_mask.h"
+#include "highlights.h"
+#include "job.h"
+#include "layers.h"
+#include "memory.h"
 #include "rules.h"
+#include "simd.h"
 
 namespace torchdof {
 namespace {
@@ -14,7 +33,7 @@ namespace {
 constexpr float LEAST = constants::composite::LEAST;
 constexpr float COVERED = 1e-6f;  // an uncovered part up to this is a rounding error
 constexpr int TILE_PIXELS = TILE * TILE;
-constexpr int PART = 16;  // side in pixels of the parts of a coarse canvas that are skipped if empty
+constexpr int PART = 16;                // side in pixels of the parts of a coarse canvas that are skipped if empty
 constexpr float EVEN_SQUARED = 1e-12f;  // square of the difference from 1 up to which a normalizer counts as 1
 
 // Consecutive layers of one resolution, composited together. Under occlusion a coarse run lies on one side of the
@@ -68,10 +87,10 @@ struct MaskedKernels {
 struct Scratch {
   std::vector<float> memory;
   std::vector<float *> light, coc, weight;  // of each surface (light: [surfaces, channels])
-  std::vector<float *> term;    // of one layer: light, share, normalizer
-  std::vector<float *> canvas;  // light and coverage of a tile
-  float *traced;                // light of highlights in a tile
-  float *farther;  // weight of surfaces that lie wholly behind a coarse layer
+  std::vector<float *> term;                // of one layer: light, share, normalizer
+  std::vector<float *> canvas;              // light and coverage of a tile
+  float *traced;                            // light of highlights in a tile
+  float *farther;                           // weight of surfaces that lie wholly behind a coarse layer
   // column marks (see `mark`) of each row: where the layer has a share, where its normalizer exceeds the share (so that
   // coverage is below 1), and where the normalizer differs from 1
   std::vector<uint32_t> occupied, partial, varying, every;
@@ -144,10 +163,12 @@ class Composite {
       downsampled_.emplace_back(new Downsampled(job_, run.scale, margin));
       downsampled_.back()->take(job_, index_, border_);
     }
-    job_.parallel((int)coarse.size(), [&](int i, int worker) { coarse_tile(runs_[coarse[i].first], coarse[i].second, scratch(worker)); });
+    job_.parallel((int)coarse.size(),
+                  [&](int i, int worker) { coarse_tile(runs_[coarse[i].first], coarse[i].second, scratch(worker)); });
     if (!job_.rays.empty()) sort_rays();
     const int columns = ceil_div(W_, TILE);
-    job_.parallel(ceil_div(H_, TILE) * columns, [&](int i, int worker) { tile(i / columns, i % columns, scratch(worker)); });
+    job_.parallel(ceil_div(H_, TILE) * columns,
+                  [&](int i, int worker) { tile(i / columns, i % columns, scratch(worker)); });
   }
 
  private:
@@ -177,9 +198,6 @@ class Composite {
   }
 
   // Finds the node before each pixel of each surface, and the layers that occur in each cell of CELL x CELL pixels.
-  //
-  // Fills a block at once if it shows one surface that lies between two neighbouring nodes. In other blocks, compares the
-  // places of a cell's pixels with the nodes between the smallest and the largest one.
   void index() {
     index_.words = (N_ + 63) / 64;
     index_.rows = ceil_div(H_, CELL);
@@ -188,103 +206,136 @@ class Composite {
     index_.single.assign((size_t)index_.rows * index_.columns, 0);
     index_.mixed.assign(index_.single.size(), 0);
     for (int i = 0; i < s_.count; i++) index_.intervals.emplace_back(s_.area());
-    auto node_before = [&](float place) {
-      const auto after = std::upper_bound(layers_.begin() + 1, layers_.end(), place, [](float at, const Layer &l) { return at < l.at; });
-      return (int)(after - layers_.begin()) - 1;
-    };
-    auto mark = [&](uint64_t *bits, float place, int k) {
-      bits[k / 64] |= 1ull << k % 64;
-      if (place > layers_[k].at) bits[(k + 1) / 64] |= 1ull << (k + 1) % 64;
-    };
     constexpr int CELLS = BLOCK / CELL;
     job_.parallel(s_.block_rows, [&](int by, int) {
       std::vector<const float *> light(C_);
-      const float *coc, *weight;
       for (int bx = 0; bx < s_.block_columns; bx++) {
-        const int block = by * s_.block_columns + bx, y_end = std::min(H_, (by + 1) * BLOCK), x_end = std::min(W_, (bx + 1) * BLOCK);
-        if (!s_.full_planes() && !s_.has_block(block)) {  // one surface, usually between two neighbouring nodes
-          const float low = index_.place(job_.block_low[block]), high = index_.place(job_.block_high[block]);
-          const int k = node_before(low);
-          if (k == node_before(high)) {
-            for (int y = by * BLOCK; y < y_end; y++) std::fill(&index_.intervals[0][(size_t)y * W_ + bx * BLOCK], &index_.intervals[0][(size_t)y * W_ + x_end - 1] + 1, (uint16_t)k);
-            for (int row = by * CELLS; row * CELL < y_end && row < (by + 1) * CELLS; row++)
-              for (int column = bx * CELLS; column * CELL < x_end && column < (bx + 1) * CELLS; column++) {
-                const size_t cell = (size_t)row * index_.columns + column;
-                mark(&index_.bits[cell * index_.words], low, k);
-                mark(&index_.bits[cell * index_.words], high, k);
-                index_.single[cell] = !s_.independent;
-              }
-            continue;
-          }
-        }
-        for (int row = by * CELLS; row * CELL < y_end && row < (by + 1) * CELLS; row++)
-          for (int column = bx * CELLS; column * CELL < x_end && column < (bx + 1) * CELLS; column++) {
-            const size_t cell = (size_t)row * index_.columns + column;
-            uint64_t *bits = &index_.bits[cell * index_.words];
-            const int x0 = column * CELL, n = std::min(CELL, W_ - x0), rows = std::min(CELL, H_ - row * CELL);
-            float own_cocs[CELL * CELL], own_weights[CELL * CELL];
-            bool single = true;
-            for (int i = 0; i < s_.count; i++) {
-              // places: of all pixels; shown: of pixels with weight. A row cut off by the frame repeats its last pixel.
-              float places[CELL * CELL], shown[CELL * CELL], cut_coc[CELL], cut_weight[CELL];
-              vec lows = all(NEVER), highs = all(-NEVER), least_weight = all(1.0f), most_weight = {}, farther_weight = {};
-              bool there = true;
-              for (int y = 0; y < rows; y++) {
-                if (!(there = s_.row(i, row * CELL + y, x0, light.data(), coc, weight))) break;
-                for (int x = 0; n < CELL && x < CELL; x++) {
-                  cut_coc[x] = coc[std::min(x, n - 1)];
-                  if (weight) cut_weight[x] = weight[std::min(x, n - 1)];
-                }
-                if (n < CELL) coc = cut_coc, weight = weight ? cut_weight : nullptr;
-                for (int x = 0; x < CELL; x += LANES) {
-                  const vec its_coc = load<vec>(coc + x), place = index_.place(its_coc), w = weight ? load<vec>(weight + x) : all(1.0f);
-                  const auto weighs = w != vec{};
-                  store(places + y * CELL + x, place);
-                  store(shown + y * CELL + x, weighs ? place : all(NEVER));
-                  lows = least(lows, weighs ? place : all(NEVER));
-                  highs = most(highs, weighs ? place : all(-NEVER));
-                  least_weight = least(least_weight, w);
-                  most_weight = most(most_weight, w);
-                  float *const own_coc = own_cocs + y * CELL + x, *const own_weight = own_weights + y * CELL + x;
-                  if (i) farther_weight = most(farther_weight, its_coc < load<vec>(own_coc) ? load<vec>(own_weight) : w);
-                  if (!i) store(own_coc, its_coc), store(own_weight, w);
-                }
-              }
-              if (!there) continue;
-              single &= i ? !any_positive(most_weight) : smallest(least_weight) >= 1;
-              if (i) index_.mixed[cell] = largest(farther_weight) > HIDDEN_WEIGHT;
-              uint16_t *intervals = &index_.intervals[i][(size_t)row * CELL * W_ + x0];
-              const bool any = any_positive(most_weight);
-              const int first = any ? node_before(smallest(lows)) : 0, last = any ? node_before(largest(highs)) : 0;
-              if (first == last) {
-                for (int y = 0; y < rows; y++) std::fill(intervals + (size_t)y * W_, intervals + (size_t)y * W_ + n, (uint16_t)first);
-                if (any) mark(bits, smallest(lows), first), mark(bits, largest(highs), first);
-                continue;
-              }
-              for (int y = 0; y < rows; y++) {
-                int32_t nodes[CELL];
-                for (int x = 0; x < CELL; x += LANES) {
-                  const vec place = load<vec>(places + y * CELL + x);
-                  ivec node = ivec{} + first;
-                  for (int k = first + 1; k <= last; k++) node -= place >= all(layers_[k].at);
-                  store(nodes + x, node);
-                }
-                for (int x = 0; x < n; x++) intervals[(size_t)y * W_ + x] = (uint16_t)nodes[x];
-              }
-              for (int k = first; k <= std::min(last + 1, N_ - 1); k++) {  // layer k occurs between nodes k - 1 and k + 1
-                const vec before = all(k == first ? -NEVER : layers_[k - 1].at), after = all(k > last || k == N_ - 1 ? NEVER : layers_[k + 1].at);
-                ivec found = {};
-                for (int j = 0; j < rows * CELL; j += LANES) {
-                  const vec place = load<vec>(shown + j);
-                  found |= (place > before) & (place < after);
-                }
-                if (any_of(found)) bits[k / 64] |= 1ull << k % 64;
-              }
-            }
-            index_.single[cell] = single && !s_.independent;
-          }
+        if (index_at_once(by, bx)) continue;
+        for (int row = by * CELLS; row < std::min((by + 1) * CELLS, index_.rows); row++)
+          for (int column = bx * CELLS; column < std::min((bx + 1) * CELLS, index_.columns); column++)
+            index_cell(row, column, light.data());
       }
     });
+  }
+
+  int node_before(float place) const {
+    const auto is_before = [](float at, const Layer &l) { return at < l.at; };
+    const auto after = std::upper_bound(layers_.begin() + 1, layers_.end(), place, is_before);
+    return (int)(after - layers_.begin()) - 1;
+  }
+
+  // Marks the layers of a place after node k.
+  void mark_layers(uint64_t *bits, float place, int k) const {
+    bits[k / 64] |= 1ull << k % 64;
+    if (place > layers_[k].at) bits[(k + 1) / 64] |= 1ull << (k + 1) % 64;
+  }
+
+  // Indexes a block at once if it shows one surface that lies between two neighbouring nodes, as it usually does; else
+  // returns false.
+  bool index_at_once(int by, int bx) {
+    constexpr int CELLS = BLOCK / CELL;
+    const int block = by * s_.block_columns + bx;
+    if (s_.full_planes() || s_.has_block(block)) return false;
+    const float low = index_.place(job_.block_low[block]), high = index_.place(job_.block_high[block]);
+    const int k = node_before(low), columns = std::min(BLOCK, W_ - bx * BLOCK);
+    if (k != node_before(high)) return false;
+    for (int y = by * BLOCK; y < std::min(H_, (by + 1) * BLOCK); y++)
+      std::fill_n(&index_.intervals[0][(size_t)y * W_ + bx * BLOCK], columns, (uint16_t)k);
+    for (int row = by * CELLS; row < std::min((by + 1) * CELLS, index_.rows); row++)
+      for (int column = bx * CELLS; column < std::min((bx + 1) * CELLS, index_.columns); column++) {
+        const size_t cell = (size_t)row * index_.columns + column;
+        mark_layers(&index_.bits[cell * index_.words], low, k);
+        mark_layers(&index_.bits[cell * index_.words], high, k);
+        index_.single[cell] = !s_.independent;
+      }
+    return true;
+  }
+
+  // The places of a cell's pixels. A row cut off by the frame repeats its last pixel.
+  struct CellPlaces {
+    float all[CELL * CELL], shown[CELL * CELL];                // shown: of pixels with weight, else NEVER
+    float own_cocs[CELL * CELL], own_weights[CELL * CELL];     // of the first surface
+    vec low, high, least_weight, most_weight, farther_weight;  // farther_weight: largest of the farther of two surfaces
+  };
+
+  void index_cell(int row, int column, const float **light) {
+    const size_t cell = (size_t)row * index_.columns + column;
+    CellPlaces p;
+    bool single = true;
+    for (int i = 0; i < s_.count; i++) {
+      if (!read_places(row, column, i, light, p)) continue;
+      single &= i ? !any_positive(p.most_weight) : reduce_min(p.least_weight) >= 1;
+      if (i) index_.mixed[cell] = reduce_max(p.farther_weight) > HIDDEN_WEIGHT;
+      index_surface(row, column, i, p);
+    }
+    index_.single[cell] = single && !s_.independent;
+  }
+
+  // Returns false if a cell has no surface i.
+  bool read_places(int row, int column, int i, const float **light, CellPlaces &p) const {
+    const int x0 = column * CELL, n = std::min(CELL, W_ - x0), rows = std::min(CELL, H_ - row * CELL);
+    p.low = broadcast(NEVER), p.high = broadcast(-NEVER);
+    p.least_weight = broadcast(1.0f), p.most_weight = p.farther_weight = vec{};
+    for (int y = 0; y < rows; y++) {
+      const float *coc, *weight;
+      float cut_coc[CELL], cut_weight[CELL];
+      if (!s_.row(i, row * CELL + y, x0, light, coc, weight)) return false;
+      for (int x = 0; n < CELL && x < CELL; x++) {
+        cut_coc[x] = coc[std::min(x, n - 1)];
+        if (weight) cut_weight[x] = weight[std::min(x, n - 1)];
+      }
+      if (n < CELL) coc = cut_coc, weight = weight ? cut_weight : nullptr;
+      for (int x = 0; x < CELL; x += LANES) {
+        const vec its_coc = load<vec>(coc + x), place = index_.place(its_coc);
+        const vec w = weight ? load<vec>(weight + x) : broadcast(1.0f);
+        const auto weighs = w != vec{};
+        store(p.all + y * CELL + x, place);
+        store(p.shown + y * CELL + x, weighs ? place : broadcast(NEVER));
+        p.low = min(p.low, weighs ? place : broadcast(NEVER));
+        p.high = max(p.high, weighs ? place : broadcast(-NEVER));
+        p.least_weight = min(p.least_weight, w);
+        p.most_weight = max(p.most_weight, w);
+        float *const own_coc = p.own_cocs + y * CELL + x, *const own_weight = p.own_weights + y * CELL + x;
+        if (i) p.farther_weight = max(p.farther_weight, its_coc < load<vec>(own_coc) ? load<vec>(own_weight) : w);
+        if (!i) store(own_coc, its_coc), store(own_weight, w);
+      }
+    }
+    return true;
+  }
+
+  // Writes the node before each pixel of surface i in a cell, and marks the layers in which it occurs: compares the
+  // places with the nodes between the smallest and the largest one.
+  void index_surface(int row, int column, int i, const CellPlaces &p) {
+    const int x0 = column * CELL, n = std::min(CELL, W_ - x0), rows = std::min(CELL, H_ - row * CELL);
+    uint64_t *const bits = &index_.bits[((size_t)row * index_.columns + column) * index_.words];
+    uint16_t *const intervals = &index_.intervals[i][(size_t)row * CELL * W_ + x0];
+    const bool any = any_positive(p.most_weight);
+    const int first = any ? node_before(reduce_min(p.low)) : 0, last = any ? node_before(reduce_max(p.high)) : 0;
+    if (first == last) {
+      for (int y = 0; y < rows; y++) std::fill_n(intervals + (size_t)y * W_, n, (uint16_t)first);
+      if (any) mark_layers(bits, reduce_min(p.low), first), mark_layers(bits, reduce_max(p.high), first);
+      return;
+    }
+    for (int y = 0; y < rows; y++) {
+      int32_t nodes[CELL];
+      for (int x = 0; x < CELL; x += LANES) {
+        const vec place = load<vec>(p.all + y * CELL + x);
+        ivec node = ivec{} + first;
+        for (int k = first + 1; k <= last; k++) node -= place >= broadcast(layers_[k].at);
+        store(nodes + x, node);
+      }
+      for (int x = 0; x < n; x++) intervals[(size_t)y * W_ + x] = (uint16_t)nodes[x];
+    }
+    for (int k = first; k <= std::min(last + 1, N_ - 1); k++) {  // layer k occurs between nodes k - 1 and k + 1
+      const vec before = broadcast(k == first ? -NEVER : layers_[k - 1].at);
+      const vec after = broadcast(k > last || k == N_ - 1 ? NEVER : layers_[k + 1].at);
+      ivec found = {};
+      for (int j = 0; j < rows * CELL; j += LANES) {
+        const vec place = load<vec>(p.shown + j);
+        found |= (place > before) & (place < after);
+      }
+      if (any_of(found)) bits[k / 64] |= 1ull << k % 64;
+    }
   }
 
   // Collects the layers of a range of cells; returns whether these show the first surface alone.
@@ -335,13 +386,15 @@ class Composite {
     }
     for (int c = 0; c < C_ + E_; c++)
       for (int y = 0; y < rows; y++)
-        memcpy(&run.canvas[((size_t)c * run.rows + tile_y + y) * run.columns + tile_x], b.canvas[c] + y * TILE, columns * sizeof(float));
+        memcpy(&run.canvas[((size_t)c * run.rows + tile_y + y) * run.columns + tile_x], b.canvas[c] + y * TILE,
+               columns * sizeof(float));
     for (int y = 0; y < rows; y += PART)
       for (int x = 0; x < columns; x += PART) {
         vec most_cover = {};
         for (int e = 0; e < E_; e++)
           for (int i = 0; i < PART; i++)
-            for (int j = 0; j < PART; j += LANES) most_cover = most(most_cover, load<vec>(b.canvas[C_ + e] + (y + i) * TILE + x + j));
+            for (int j = 0; j < PART; j += LANES)
+              most_cover = max(most_cover, load<vec>(b.canvas[C_ + e] + (y + i) * TILE + x + j));
         run.used[(size_t)(tile_y + y) / PART * run.part_columns + (tile_x + x) / PART] = any_positive(most_cover);
       }
   }
@@ -370,7 +423,8 @@ class Composite {
         const float *values = &pieces.values[(size_t)i * stride];
         if (node >= L) b.farther[(size_t)y * pitch_ + x] += values[0];
         if (node < 0 || node >= L) continue;
-        p.unsorted.push_back({values, (uint16_t)y, (uint16_t)x, (uint16_t)node, (pieces.node[i] & Pieces::NORMALIZER_ONLY) != 0});
+        p.unsorted.push_back(
+            {values, (uint16_t)y, (uint16_t)x, (uint16_t)node, (pieces.node[i] & Pieces::NORMALIZER_ONLY) != 0});
         p.start[node + 1]++;
       }
     }
@@ -381,12 +435,14 @@ class Composite {
   }
 
   // The terms of layer k in a window. Adds the weight between node k and the next to `farther`.
-  void downsampled_terms(const Run &run, const Downsampled &d, int k, int top, int left, int height, int width, int spare, Scratch &b) {
+  void downsampled_terms(const Run &run, const Downsampled &d, int k, int top, int left, int height, int width,
+                         int spare, Scratch &b) {
     const int C = C_;
-    const vec at = all((float)k), before = all((float)(k - 1));
+    const vec at = broadcast((float)k), before = broadcast((float)(k - 1));
     for (int y = spare; y < height - spare; y++) {
       const size_t to = (size_t)y * pitch_;
-      const float *node = d.row(0, top + y) + left, *one = d.row(1, top + y) + left, *two = d.row(C + 2, top + y) + left;
+      const float *node = d.row(0, top + y) + left, *one = d.row(1, top + y) + left,
+                  *two = d.row(C + 2, top + y) + left;
       float *share = b.term[C] + to, *normalizer = b.term[C + 1] + to;
       uint32_t occupied = 0, partial = 0, varying = 0;
       for (int x0 = 0; x0 < width; x0 += MARKED) {
@@ -397,12 +453,13 @@ class Composite {
           const vec w = load<vec>(one + x), part = load<vec>(two + x);
           const vec ramp = ahead ? part : vec{}, its_share = behind ? w - part : ramp;
           store(share + x, its_share);
-          some = most(some, its_share);
+          some = max(some, its_share);
           if (!over_) continue;
-          const vec its_normalizer = (n >= at ? w : ramp) + load<vec>(b.farther + to + x), from_one = its_normalizer - all(1.0f);
+          const vec its_normalizer = (n >= at ? w : ramp) + load<vec>(b.farther + to + x),
+                    from_one = its_normalizer - 1.0f;
           store(normalizer + x, its_normalizer);
-          more = most(more, its_normalizer - its_share);
-          other = most(other, from_one * from_one - all(EVEN_SQUARED));
+          more = max(more, its_normalizer - its_share);
+          other = max(other, from_one * from_one - EVEN_SQUARED);
         }
         const uint32_t bit = mark(x0);
         occupied |= any_positive(some) ? bit : 0;
@@ -462,8 +519,8 @@ class Composite {
     }
   }
 
-  // The terms of layer k for surfaces that cover each other, in rows from `first` and columns from `from` of a window: computes
-  // each row of pixels and averages over s x s.
+  // The terms of layer k for surfaces that cover each other, in rows from `first` and columns from `from` of a window:
+  // computes each row of pixels and averages over s x s.
   void block_means(int k, int s, int top, int left, int height, int width, int first, int from, Scratch &b) {
     const float each = 1.0f / (s * s);
     const int n = width * s;
@@ -487,8 +544,10 @@ class Composite {
   }
 
   // Reads a row of all surfaces, extended beyond the frame: light [surfaces, channels], place on the blur axis, weight.
-  void read_row(int y, int x0, int n, bool single, float *const *light, float *const *coc, float *const *weight, Scratch &b) {
-    const int at_y = std::clamp(y, 0, H_ - 1), first = std::clamp(x0, 0, W_ - 1), last = std::clamp(x0 + n - 1, 0, W_ - 1);
+  void read_row(int y, int x0, int n, bool single, float *const *light, float *const *coc, float *const *weight,
+                Scratch &b) {
+    const int at_y = std::clamp(y, 0, H_ - 1), first = std::clamp(x0, 0, W_ - 1),
+              last = std::clamp(x0 + n - 1, 0, W_ - 1);
     const int before = std::max(0, std::min(n, -x0)), after = std::max(0, std::min(n, x0 + n - W_));
     for (int i = 0; i < (single ? 1 : s_.count); i++) {
       const float *from_coc, *from_weight;
@@ -530,7 +589,8 @@ class Composite {
         extend(row);
         for (int x = 0; x < before; x++) row[x] = border_.light(i, c, y, x0 + x, row[x]);
         for (int x = n - after; x < n; x++) row[x] = border_.light(i, c, y, x0 + x, row[x]);
-        if (y != at_y && before + after < n) border_.continue_row(i, c, y, x0 + before, n - before - after, row + before);
+        if (y != at_y && before + after < n)
+          border_.continue_row(i, c, y, x0 + before, n - before - after, row + before);
       }
       extend(coc[i]);
       extend(weight[i]);
@@ -542,14 +602,15 @@ class Composite {
   // behind the layer; g: its share at the layer. Each surface in turn takes its part of what nearer surfaces at the
   // layer left. The normalizer is the share that surfaces in front of the layer leave visible, where any surface behind
   // them is known.
-  void row_terms(const Layer &l, int n, const float *const *light, const float *const *place, const float *const *weight, float *const *term) const {
+  void row_terms(const Layer &l, int n, const float *const *light, const float *const *place,
+                 const float *const *weight, float *const *term) const {
     std::vector<vec> m(s_.count);  // share of each surface
     for (int i = 0; i < n; i += LANES) {
-      vec left = all(1.0f), unknown = left, normalizer = left, share = {};
+      vec left = broadcast(1.0f), unknown = left, normalizer = left, share = {};
       for (int j = 0; j < s_.count; j++) {
         const vec p = load<vec>(place[j] + i), cover = load<vec>(weight[j] + i), h = at_or_behind(l, p, over_);
-        const vec here = cover * eased(least(h / HIDING_SHARE, all(1.0f))), there = 1.0f - here * (1.0f - h);
-        const vec stops = cover * (h - behind(l, p, over_)) / most(there, all(LEAST_PASSING));
+        const vec here = cover * eased(min(h / HIDING_SHARE, broadcast(1.0f))), there = 1.0f - here * (1.0f - h);
+        const vec stops = cover * (h - behind(l, p, over_)) / max(there, broadcast(LEAST_PASSING));
         m[j] = left * stops;
         left *= 1.0f - stops;
         normalizer *= there;
@@ -575,7 +636,8 @@ class Composite {
         const float from_one = normalizer[x] - 1.0f;
         b.occupied[y] |= share[x] > 0 ? mark(x) : 0;
         if (!over_) continue;
-        b.partial[y] |= normalizer[x] != share[x] ? mark(x) : 0;  // may also be smaller, where a share is below HIDING_SHARE
+        b.partial[y] |=
+            normalizer[x] != share[x] ? mark(x) : 0;  // may also be smaller, where a share is below HIDING_SHARE
         b.varying[y] |= from_one * from_one > EVEN_SQUARED ? mark(x) : 0;
       }
     }
@@ -591,10 +653,12 @@ class Composite {
     for (int i = 0; i < block_rows * block_columns; i++) {
       const int y0 = floor_div(top, BLOCK) * BLOCK + i / block_columns * BLOCK, x0 = left + i % block_columns * BLOCK;
       const bool inside = y0 >= 0 && x0 >= 0 && y0 + BLOCK <= H_ && x0 + BLOCK <= W_;
-      const int y_in = std::clamp(y0, 0, (s_.block_rows - 1) * BLOCK), x_in = std::clamp(x0, 0, (s_.block_columns - 1) * BLOCK);
+      const int y_in = std::clamp(y0, 0, (s_.block_rows - 1) * BLOCK),
+                x_in = std::clamp(x0, 0, (s_.block_columns - 1) * BLOCK);
       WindowBlock w;
       uint64_t *layers = &b.block_layers[(size_t)i * index_.words];
-      const bool single = around(y_in / CELL, y_in / CELL + BLOCK / CELL - 1, x_in / CELL, x_in / CELL + BLOCK / CELL - 1, layers);
+      const bool single =
+          around(y_in / CELL, y_in / CELL + BLOCK / CELL - 1, x_in / CELL, x_in / CELL + BLOCK / CELL - 1, layers);
       w.layers = layers;
       w.count = single ? 1 : s_.count;
       w.top = std::max(y0 - top, 0);
@@ -605,7 +669,7 @@ class Composite {
       const int first_row = top + w.top;
       for (int j = 0; j < w.count && inside; j++) {
         WindowBlock::Surface &of = w.surfaces[j];
-        const float *from;
+        const float *from = nullptr;
         s_.row(j, first_row, x0, b.pointers.data(), from, of.weight);
         const bool in_block = s_.has_block(first_row / BLOCK * s_.block_columns + x0 / BLOCK);
         of.light = b.pointers[0];
@@ -615,7 +679,8 @@ class Composite {
         if (single) of.weight = nullptr;
         if (!over_ && !has_fine(layers)) continue;  // no layer needs the places
         for (int y = w.top; y < w.top + w.rows; y++, from += j ? BLOCK : W_)
-          for (int x = 0; x < BLOCK; x += LANES) store(b.coc[j] + (size_t)y * pitch_ + w.column + x, index_.place(load<vec>(from + x)));
+          for (int x = 0; x < BLOCK; x += LANES)
+            store(b.coc[j] + (size_t)y * pitch_ + w.column + x, index_.place(load<vec>(from + x)));
       }
       if (!inside) {
         for (int y = w.top; y < w.top + w.rows; y++) {
@@ -659,8 +724,9 @@ class Composite {
       if (has(w.layers, k)) {
         w.clear = false;
         w.normalizer = WindowBlock::STALE;
-        const auto terms = C_ == 3 ? (w.count == 1 ? &Composite::block_terms<3, 1, true> : &Composite::block_terms<3, 2, true>)
-                                   : (w.count == 1 ? &Composite::block_terms<0, 1, true> : &Composite::block_terms<0, 2, true>);
+        const auto terms =
+            C_ == 3 ? (w.count == 1 ? &Composite::block_terms<3, 1, true> : &Composite::block_terms<3, 2, true>)
+                    : (w.count == 1 ? &Composite::block_terms<0, 1, true> : &Composite::block_terms<0, 2, true>);
         (this->*terms)(layers_[k], w, y0, y1, x0, x1, &b.partial[w.top], &b.varying[w.top], b);
         continue;
       }
@@ -700,10 +766,11 @@ class Composite {
     }
   }
 
-  // The terms of layer l in columns x0 to x1 of a block and rows y0 to y1 of the window; only the normalizer, if the layer
-  // does not occur in the block. partial, varying: marks of the block's rows.
+  // The terms of layer l in columns x0 to x1 of a block and rows y0 to y1 of the window; only the normalizer, if the
+  // layer does not occur in the block. partial, varying: marks of the block's rows.
   template <int CHANNELS, int COUNT, bool OCCURS>
-  void block_terms(const Layer &l, const WindowBlock &w, int y0, int y1, int x0, int x1, uint32_t *partial, uint32_t *varying, Scratch &b) {
+  void block_terms(const Layer &l, const WindowBlock &w, int y0, int y1, int x0, int x1, uint32_t *partial,
+                   uint32_t *varying, Scratch &b) {
     const int C = CHANNELS ? CHANNELS : C_;
     for (int y = y0; y < y1; y++) {
       const size_t row = y - w.top, at = (size_t)y * pitch_ + w.column;
@@ -713,7 +780,7 @@ class Composite {
           const WindowBlock::Surface &of = w.surfaces[j];
           p[j] = load<vec>(b.coc[j] + at + x);
           h[j] = at_or_behind(l, p[j], over_);
-          weight[j] = of.weight ? load<vec>(of.weight + row * of.weight_pitch + x) : all(1.0f);
+          weight[j] = of.weight ? load<vec>(of.weight + row * of.weight_pitch + x) : broadcast(1.0f);
         }
         if (COUNT == 2) add_continuation(p, h, weight);
         for (int j = 0; j < COUNT; j++) normalizer += h[j] * weight[j];
@@ -729,16 +796,19 @@ class Composite {
           for (int c = 0; c < C; c++) {
             vec sum = {};
             for (int j = 0; j < COUNT; j++)
-              if (has_light[j]) sum += load<vec>(w.surfaces[j].light + c * w.surfaces[j].channel + row * w.surfaces[j].light_pitch + x) * surface_share[j];
+              if (has_light[j])
+                sum +=
+                    load<vec>(w.surfaces[j].light + c * w.surfaces[j].channel + row * w.surfaces[j].light_pitch + x) *
+                    surface_share[j];
             store(b.term[c] + at + x, sum);
           }
           b.occupied[y] |= any_positive(share) ? bit : 0;
         }
         if (!over_) continue;
-        const vec from_one = normalizer - all(1.0f);
+        const vec from_one = normalizer - 1.0f;
         store(b.term[C + 1] + at + x, normalizer);
         partial[row] |= any_positive(normalizer - share) ? bit : 0;
-        varying[row] |= any_positive(from_one * from_one - all(EVEN_SQUARED)) ? bit : 0;
+        varying[row] |= any_positive(from_one * from_one - EVEN_SQUARED) ? bit : 0;
       }
     }
   }
@@ -773,7 +843,8 @@ class Composite {
     const float per = per_half_diagonal(scene);
     const float y = (((block_row + 0.5f) * FieldMask::ROWS - before) * l.scale - 0.5f * H_) * per;
     const float x = (((block_column + 0.5f) * FieldMask::COLUMNS - before) * l.scale - 0.5f * W_) * per;
-    for (int e = 0; e < E_; e++) mask_kernel(l, e, FieldMask(scene, *l.field_mask, nullptr, 0.0f, e, y, x), masked.kernels[e]);
+    for (int e = 0; e < E_; e++)
+      mask_kernel(l, e, FieldMask(scene, *l.field_mask, nullptr, 0.0f, e, y, x), masked.kernels[e]);
     return masked.kernels.data();
   }
 
@@ -817,7 +888,8 @@ class Composite {
     }
   }
 
-  void composite_strip(Scratch &b, const Kernel *kernels, size_t from, int y, uint32_t within, bool partial, bool varying, int at) {
+  void composite_strip(Scratch &b, const Kernel *kernels, size_t from, int y, uint32_t within, bool partial,
+                       bool varying, int at) {
     float share[STRIP], normalizer[STRIP], gain[STRIP], left[STRIP], light[STRIP];
     for (int e = 0; e < E_; e++) {
       const Kernel &kernel = kernels[e];
@@ -832,10 +904,12 @@ class Composite {
       // colour = light / normalizer, coverage = share / normalizer
       float *const canvas = b.canvas[C_ + e] + at;
       for (int i = 0; i < STRIP; i += LANES) {
-        const vec all_normalizer = load<vec>(normalizer + i), its_share = load<vec>(share + i), missing = lacking(all_normalizer);
-        const vec known = all_normalizer + raise(missing), per_normalizer = all(1.0f) / known, cover = its_share * per_normalizer;
+        const vec all_normalizer = load<vec>(normalizer + i), its_share = load<vec>(share + i),
+                  missing = lacking(all_normalizer);
+        const vec known = all_normalizer + raise(missing), per_normalizer = 1.0f / known,
+                  cover = its_share * per_normalizer;
         // a layer that covers a pixel fully removes all light behind it, however bright
-        const vec its_left = its_share < known ? most(all(1.0f) - cover, vec{}) : vec{};
+        const vec its_left = its_share < known ? max(1.0f - cover, vec{}) : vec{};
         store(gain + i, per_normalizer);
         store(left + i, its_left);
         float *to = canvas + i / STRIP_COLUMNS * TILE + i % STRIP_COLUMNS;
@@ -851,6 +925,42 @@ class Composite {
     }
   }
 
+  static constexpr int WIDENED =
+      TILE + 32;  // values of a widened row, which begins half a coarse pixel before the tile
+
+  // Widens a row of a coarser canvas, from column `first` on, to the tile's resolution: to [channels + colours,
+  // WIDENED]. Returns false if it covers nothing.
+  bool widen(const Run &run, int row, int first, float *to) const {
+    const int s = run.scale, inside = std::max(std::min(TILE / s + 1, run.columns - 1 - first), 0);
+    float ramp[16];
+    for (int i = 0; i < 16; i++) ramp[i] = (i % s + 0.5f) / s;
+    vec most_cover = {};
+    for (int c = C_ + E_ - 1; c >= 0; c--) {
+      const float *from = &run.canvas[((size_t)c * run.rows + row) * run.columns + first];
+      if (c >= C_) {
+        for (int i = 0; i <= inside; i += LANES) most_cover = max(most_cover, load<vec>(from + i));
+      } else if (!any_positive(most_cover)) {
+        memset(to, 0, (size_t)(C_ + E_) * WIDENED * sizeof(float));
+        return false;
+      }
+      float *v = to + (size_t)c * WIDENED;
+      if (s == 2)
+        for (int i = 0; i < inside; i++) {
+          const float step = from[i + 1] - from[i];
+          v[2 * i] = from[i] + 0.25f * step;
+          v[2 * i + 1] = from[i] + 0.75f * step;
+        }
+      else
+        for (int i = 0; i < inside; i++)
+          for (int part = 0; part < s; part += 4, v += 4) {
+            typedef float f4 __attribute__((vector_size(16)));
+            const f4 value = f4{} + from[i], step = f4{} + (from[i + 1] - from[i]);
+            store(v, value + step * load<f4>(ramp + part));
+          }
+    }
+    return true;
+  }
+
   // Composites a coarser canvas, interpolated, onto the tile's canvas.
   //
   // 1. Return if no layer of the run reaches the tile.
@@ -858,60 +968,30 @@ class Composite {
   // 3. Interpolate between them, and put the result in front of the tile's row.
   void join_finer(const Run &run, int y0, int x0, Scratch &b) {
     const int s = run.scale;
-    const int r1 = std::min((y0 + TILE) / s + 1, run.rows - 1) / PART, c1 = std::min((x0 + TILE) / s + 1, run.columns - 1) / PART;
+    const int r1 = std::min((y0 + TILE) / s + 1, run.rows - 1) / PART,
+              c1 = std::min((x0 + TILE) / s + 1, run.columns - 1) / PART;
     bool any = false;
     for (int r = y0 / s / PART; r <= r1; r++)
       for (int c = x0 / s / PART; c <= c1; c++) any |= run.used[(size_t)r * run.part_columns + c];
     if (!any) return;
-    const int channels = C_ + E_, count = TILE / s + 1, first = x0 / s, pitch = TILE + 32;
-    std::vector<float> memory((size_t)2 * channels * pitch);
-    float *upper = memory.data(), *lower = upper + channels * pitch;  // two rows, widened to the tile's resolution
+    const int channels = C_ + E_;
+    std::vector<float> memory((size_t)2 * channels * WIDENED);
+    float *upper = memory.data(), *lower = upper + channels * WIDENED;  // two rows, widened to the tile's resolution
     bool upper_covers = false, lower_covers = false;
-    float ramp[16];
-    for (int i = 0; i < 16; i++) ramp[i] = (i % s + 0.5f) / s;
-    auto widen = [&](int row, float *to) {
-      vec most_cover = {};
-      for (int c = channels - 1; c >= 0; c--) {
-        const float *from = &run.canvas[((size_t)c * run.rows + row) * run.columns + first];
-        const int inside = std::max(std::min(count, run.columns - 1 - first), 0);
-        if (c >= C_) {
-          for (int i = 0; i <= inside; i += LANES) most_cover = most(most_cover, load<vec>(from + i));
-        } else if (!any_positive(most_cover)) {
-          memset(to, 0, (size_t)channels * pitch * sizeof(float));
-          return false;
-        }
-        float *v = to + (size_t)c * pitch;
-        if (s == 2)
-          for (int i = 0; i < inside; i++) {
-            const float step = from[i + 1] - from[i];
-            v[2 * i] = from[i] + 0.25f * step;
-            v[2 * i + 1] = from[i] + 0.75f * step;
-          }
-        else
-          for (int i = 0; i < inside; i++)
-            for (int part = 0; part < s; part += 4, v += 4) {
-              typedef float f4 __attribute__((vector_size(16)));
-              const f4 value = f4{} + from[i], step = f4{} + (from[i + 1] - from[i]);
-              store(v, value + step * load<f4>(ramp + part));
-            }
-      }
-      return true;
-    };
     for (int y = 0, known = -2; y < TILE; y++) {
       const float at_y = (y0 + y + 0.5f) / s + 0.5f;
       const int row = std::min((int)at_y, run.rows - 2);
       const float down = at_y - row;
       if (row != known) {
         std::swap(upper, lower);
-        upper_covers = row == known + 1 ? lower_covers : widen(row, upper);
-        lower_covers = widen(row + 1, lower);
+        upper_covers = row == known + 1 ? lower_covers : widen(run, row, x0 / s, upper);
+        lower_covers = widen(run, row + 1, x0 / s, lower);
         known = row;
       }
       if (!upper_covers && !lower_covers) continue;
-      // widened row: the first value lies half a coarse pixel before the tile
       auto value_at = [&](int c, int x) {
-        const vec a = load<vec>(upper + (size_t)c * pitch + s / 2 + x), b = load<vec>(lower + (size_t)c * pitch + s / 2 + x);
-        return a + down * (b - a);
+        const size_t at = (size_t)c * WIDENED + s / 2 + x;
+        return load<vec>(upper + at) + down * (load<vec>(lower + at) - load<vec>(upper + at));
       };
       for (int c = 0; c < channels; c++) {
         // light, then coverage; each keeps 1 - (coverage of this run) of the tile's value
@@ -919,7 +999,7 @@ class Composite {
         float *canvas = b.canvas[c] + y * TILE;
         for (int x = 0; x < TILE; x += LANES) {
           const vec value = value_at(c, x);
-          const vec left = over_ ? most(all(1.0f) - (c < C_ ? value_at(C_ + e, x) : value), vec{}) : all(1.0f);
+          const vec left = over_ ? max(1.0f - (c < C_ ? value_at(C_ + e, x) : value), vec{}) : broadcast(1.0f);
           store(canvas + x, value + left * load<vec>(canvas + x));
         }
       }
@@ -930,7 +1010,8 @@ class Composite {
   void add_stand_ins(int y0, int x0, int rows, int columns, Scratch &b) {
     around(y0 / CELL, (y0 + rows - 1) / CELL, x0 / CELL, (x0 + columns - 1) / CELL, b.layers.data());
     bool any = false;  // a pixel between a layer and the next one belongs to both
-    for (int k = 0; k < N_ && layers_[k].node < 0; k++) any |= layers_[std::min(k + 1, N_ - 1)].node > -2 * BARELY_BLURRED && has(b.layers.data(), k);
+    for (int k = 0; k < N_ && layers_[k].node < 0; k++)
+      any |= layers_[std::min(k + 1, N_ - 1)].node > -2 * BARELY_BLURRED && has(b.layers.data(), k);
     if (!any) return;
     std::vector<float> memory((size_t)s_.count * (C_ + 2) * (TILE + LANES));
     float *m = memory.data();
@@ -940,7 +1021,7 @@ class Composite {
     for (int y = 0; y < rows; y++) {
       read_row(y0 + y, x0, columns, false, light.data(), place.data(), weight.data(), b);
       for (int x = 0; x < columns; x += LANES) {
-        vec left = all(1.0f), share = {};
+        vec left = broadcast(1.0f), share = {};
         for (int j = 0; j < s_.count; j++) {
           const vec at = load<vec>(place[j] + x), given = load<vec>(weight[j] + x);
           b.missing[j] = 1.0f - counts(given) * at_focus(at);
@@ -948,11 +1029,11 @@ class Composite {
           if (s_.independent) left *= 1.0f - given;
         }
         for (int j = 0; j < s_.count; j++) {
-          for (int i = 0; i < s_.count; i++) b.cover[j] *= i == j ? all(1.0f) : b.missing[i];
+          for (int i = 0; i < s_.count; i++) b.cover[j] *= i == j ? broadcast(1.0f) : b.missing[i];
           share += b.cover[j];
         }
         if (!any_positive(share)) continue;
-        const vec through = most(all(1.0f) - share, vec{});
+        const vec through = max(1.0f - share, vec{});
         for (int c = 0; c < C_ + E_; c++) {
           vec sum = c < C_ ? vec{} : share;
           for (int j = 0; c < C_ && j < s_.count; j++) sum += load<vec>(light[j * C_ + c] + x) * b.cover[j];
@@ -966,11 +1047,13 @@ class Composite {
   // Renders one tile of the picture.
   //
   // 1. List the full-resolution layers whose blur reaches the tile, and read the window that they need.
-  // 2. From far to near, composite these layers and the coarser canvases onto the tile's canvas; between the focus and the
+  // 2. From far to near, composite these layers and the coarser canvases onto the tile's canvas; between the focus and
+  // the
   //    layers before it, the surfaces that stand in for the background.
   // 3. Finish: light behind all layers, highlights.
   void tile(int tile_row, int tile_column, Scratch &b) {
-    const int y0 = tile_row * TILE, x0 = tile_column * TILE, rows = std::min(TILE, H_ - y0), columns = std::min(TILE, W_ - x0);
+    const int y0 = tile_row * TILE, x0 = tile_column * TILE, rows = std::min(TILE, H_ - y0),
+              columns = std::min(TILE, W_ - x0);
     for (float *canvas : b.canvas) memset(canvas, 0, TILE_PIXELS * sizeof(float));
     // layers of full resolution whose light reaches the tile
     std::vector<int> reaching;
@@ -979,7 +1062,9 @@ class Composite {
       const Layer &l = layers_[k];
       if (l.scale > 1) continue;
       const int reach = ceil_div(l.half, CELL);
-      if (reach != known_reach) around(y0 / CELL - reach, (y0 + TILE) / CELL - 1 + reach, x0 / CELL - reach, (x0 + TILE) / CELL - 1 + reach, b.layers.data());
+      if (reach != known_reach)
+        around(y0 / CELL - reach, (y0 + TILE) / CELL - 1 + reach, x0 / CELL - reach, (x0 + TILE) / CELL - 1 + reach,
+               b.layers.data());
       known_reach = reach;
       if (!has(b.layers.data(), k)) continue;
       reaching.push_back(k);
@@ -1003,7 +1088,8 @@ class Composite {
       for (; next < reaching.size() && reaching[next] >= run.first; next++) {
         const Layer &l = layers_[reaching[next]];
         pass(l);
-        const int first = halo - l.half, from = x0 - l.half - left, reach_rows = rows + 2 * l.half, reach_columns = columns + 2 * l.half;
+        const int first = halo - l.half, from = x0 - l.half - left, reach_rows = rows + 2 * l.half,
+                  reach_columns = columns + 2 * l.half;
         if (s_.independent)
           block_means(reaching[next], 1, top + first, left + from, reach_rows, reach_columns, first, from, b);
         else
@@ -1021,7 +1107,8 @@ class Composite {
     const bool has_rays = !job_.rays.empty() && ray_start_[which] < ray_start_[which + 1];
     if (has_rays) {
       memset(traced, 0, sizeof(float) * C * TILE_PIXELS);
-      splat(job_, visibility_, y0, x0, &ray_list_[ray_start_[which]], ray_start_[which + 1] - ray_start_[which], ray_kernels_, gains_, traced);
+      splat(job_, visibility_, y0, x0, &ray_list_[ray_start_[which]], ray_start_[which + 1] - ray_start_[which],
+            ray_kernels_, gains_, traced);
     }
     const bool normalize = over_ ? job_.behind.empty() : (bool)job_.scene.normalize;
     if (has_rays && !over_)
@@ -1035,7 +1122,7 @@ class Composite {
         float *const to = out_ + at;
         for (int x = 0; x < columns; x += LANES) {
           vec v = load<vec>(canvas + x);
-          if (normalize) v = load<vec>(cover + x) > all(LEAST) ? v / load<vec>(cover + x) : vec{};
+          if (normalize) v = load<vec>(cover + x) > LEAST ? v / load<vec>(cover + x) : vec{};
           if (added) v += load<vec>(added + y * TILE + x);
           if (x + LANES <= columns)
             store(to + x, v);
@@ -1051,10 +1138,10 @@ class Composite {
   }
 
   void composite_over_behind(int y0, int x0, int rows, int columns, Scratch &b) {
-    vec least_cover = all(1.0f);
+    vec least_cover = broadcast(1.0f);
     for (int e = 0; e < E_; e++)
-      for (int i = 0; i < TILE_PIXELS; i += LANES) least_cover = least(least_cover, load<vec>(b.canvas[C_ + e] + i));
-    if (!any_of(least_cover < all(1.0f - COVERED))) return;
+      for (int i = 0; i < TILE_PIXELS; i += LANES) least_cover = min(least_cover, load<vec>(b.canvas[C_ + e] + i));
+    if (!any_of(least_cover < broadcast(1.0f - COVERED))) return;
     const int h = job_.behind_height, w = job_.behind_width;
     int before[TILE];
     float across[TILE];  // fraction of the way to the next sample
@@ -1071,18 +1158,21 @@ class Composite {
       for (int c = 0; c < C_; c++) {
         const float *cover = b.canvas[C_ + (E_ > 1 ? c : 0)] + y * TILE;
         float *canvas = b.canvas[c] + y * TILE;
-        const float *upper = &job_.behind[((size_t)c * h + top) * w], *lower = &job_.behind[((size_t)c * h + bottom) * w];
+        const float *upper = &job_.behind[((size_t)c * h + top) * w],
+                    *lower = &job_.behind[((size_t)c * h + bottom) * w];
         for (int x = 0; x < columns; x += LANES) {
-          const vec uncovered = all(1.0f) - load<vec>(cover + x), old = load<vec>(canvas + x);
-          const auto is_uncovered = uncovered > all(COVERED);
+          const vec uncovered = 1.0f - load<vec>(cover + x), old = load<vec>(canvas + x);
+          const auto is_uncovered = uncovered > COVERED;
           if (!any_of(is_uncovered)) continue;
           vec above_left, above_right, below_left, below_right;
           for (int i = 0; i < LANES; i++) {
             const int left = before[x + i], right = std::min(left + 1, w - 1);
-            above_left[i] = upper[left], above_right[i] = upper[right], below_left[i] = lower[left], below_right[i] = lower[right];
+            above_left[i] = upper[left], above_right[i] = upper[right], below_left[i] = lower[left],
+            below_right[i] = lower[right];
           }
           const vec part = load<vec>(across + x);
-          const vec above = above_left + part * (above_right - above_left), below = below_left + part * (below_right - below_left);
+          const vec above = above_left + part * (above_right - above_left),
+                    below = below_left + part * (below_right - below_left);
           store(canvas + x, is_uncovered ? old + uncovered * (above + down * (below - above)) : old);
         }
       }
@@ -1142,8 +1232,6 @@ int LayerIndex::only_interval(size_t i) const {
   return last <= first + 1 ? first : -1;
 }
 
-void composite(const Job &job, const RayKernels &ray_kernels, float *out) {
-  Composite(job, ray_kernels, out).run();
-}
+void composite(const Job &job, const RayKernels &ray_kernels, float *out) { Composite(job, ray_kernels, out).run(); }
 
 }  // namespace torchdof

@@ -5,21 +5,35 @@
 //
 //   light at distance d = (I_i + sum K_ij w_j I_j / sum K_ij w_j) / 2
 //
-// K_ij is the share of pixel j that is on the surface of pixel i or on a farther one. With all places reversed, the shares
-// are K_ji, so that the gradients of sums over windows are sums over windows again.
-#include "engine.h"
+// K_ij is the share of pixel j that is on the surface of pixel i or on a farther one. With all places reversed, the
+// shares are K_ji, so that the gradients of sums over windows are sums over windows again.
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <vector>
+
+#include "api.h"
+#include "blur_axis.h"
+#include "border.h"
+#include "entry.h"
+#include "light.h"
+#include "memory.h"
+#include "threads.h"
 
 namespace torchdof {
 namespace {
 
 // The maps of a frame. Sides are those of Border.
 struct Frame {
-  const float *const *light, *const *coc, *const *weight, *limit;  // of each surface; limit: light above which a highlight begins
-  const int32_t S, C, height, width, *ends;  // numbers of surfaces and channels; pixels added at the left, right, top, bottom
-  const float low, high;                     // ends of the blur axis
-  const int32_t image;                       // the image's own surface, or -1: each one is an image
+  const float *const *light, *const *coc, *const *weight,
+      *limit;  // of each surface; limit: light above which a highlight begins
+  const int32_t S, C, height, width,
+      *ends;              // numbers of surfaces and channels; pixels added at the left, right, top, bottom
+  const float low, high;  // ends of the blur axis
+  const int32_t image;    // the image's own surface, or -1: each one is an image
   const int threads;
-  const size_t area = (size_t)height * width, pitch = ends[0] + width + ends[1], wide_area = pitch * (ends[2] + height + ends[3]);
+  const size_t area = (size_t)height * width, pitch = ends[0] + width + ends[1],
+               wide_area = pitch * (ends[2] + height + ends[3]);
   const size_t first = ends[2] * pitch + ends[0];  // the frame's first pixel in a continued map
   const Buffer<float> x{S * area};                 // positions on the blur axis, of each surface
   const float *x_of(int s) const { return x.data() + s * area; }
@@ -54,7 +68,8 @@ struct Frame {
 
   void write(float *out) const {
     Border border(height, width, C, S, *std::max_element(ends, ends + 4));
-    parallel(threads, 4 * S, nullptr, [&](int i, int) { border.set((Border::Side)(i % 4), i / 4, line_of(i % 4, i / 4)); });
+    parallel(threads, 4 * S, nullptr,
+             [&](int i, int) { border.set((Border::Side)(i % 4), i / 4, line_of(i % 4, i / 4)); });
     parallel(threads, S * (C + 2), nullptr, [&](int plane, int) {
       const int s = plane / (C + 2), c = plane % (C + 2);
       const float *const map = c < C ? light[s] + c * area : c == C ? x_of(s) : weight[s];
@@ -70,21 +85,24 @@ struct Frame {
         }
         if (y != nearest) border.continue_row(s, c, y, 0, width, to);
         for (int column = -ends[0]; column < 0; column++) to[column] = border.light(s, c, y, column, from[0]);
-        for (int column = width; column < width + ends[1]; column++) to[column] = border.light(s, c, y, column, from[width - 1]);
+        for (int column = width; column < width + ends[1]; column++)
+          to[column] = border.light(s, c, y, column, from[width - 1]);
       }
     });
   }
 
   // Adds the gradients by light, coc and weight of each surface.
-  void gradient(const float *slopes, float *const *of_maps) const {
-    const Buffer<float> of_x(2 * S * area);  // by the position of each surface, and by that of the image next to it
-    std::fill_n(of_x.data(), 2 * S * area, 0.0f);
-    parallel(threads, S, nullptr, [&](int s, int) { add_surface(s, slopes, of_maps[s], of_maps[2 * S + s], &of_x[s * area], &of_x[(S + s) * area]); });
+  void gradient(const float *slopes, float *const *d_maps) const {
+    const Buffer<float> d_x(2 * S * area);  // by the position of each surface, and by that of the image next to it
+    std::fill_n(d_x.data(), 2 * S * area, 0.0f);
+    parallel(threads, S, nullptr, [&](int s, int) {
+      add_surface(s, slopes, d_maps[s], d_maps[2 * S + s], &d_x[s * area], &d_x[(S + s) * area]);
+    });
     parallel(threads, S * height, nullptr, [&](int row, int) {
       for (size_t s = row / height, at = (size_t)(row % height) * width, end = at + width; at < end; at++) {
-        float slope = of_x[s * area + at] + (image < 0 ? of_x[(S + s) * area + at] : 0.0f);
-        for (int i = 0; (int)s == image && i < S; i++) slope += of_x[(S + i) * area + at];
-        of_maps[S + s][at] += slope * slope_of_axis(coc[s][at]);
+        float slope = d_x[s * area + at] + (image < 0 ? d_x[(S + s) * area + at] : 0.0f);
+        for (int i = 0; (int)s == image && i < S; i++) slope += d_x[(S + i) * area + at];
+        d_maps[S + s][at] += slope * slope_of_axis(coc[s][at]);
       }
     });
   }
@@ -96,16 +114,16 @@ struct Frame {
     return moved < low || moved > high ? 0.0f : size * (size + 2 * (float)SQUARE_PX) / (sum * sum);
   }
 
-  void add_surface(int s, const float *slopes, float *of_light, float *of_weight, float *of_x, float *of_image_x) const {
+  void add_surface(int s, const float *slopes, float *d_light, float *d_weight, float *d_x, float *d_image_x) const {
     slopes += s * (C + 2) * wide_area + first;
     for (int c = 0; c < C; c++)
       for (size_t y = 0; y < (size_t)height; y++)
-        for (int at = 0; at < width; at++) of_light[c * area + y * width + at] += slopes[c * wide_area + y * pitch + at];
-    for (int side = 0; side < 4; side++) add_line(side, s, slopes, of_light, of_weight, of_x, of_image_x);
+        for (int at = 0; at < width; at++) d_light[c * area + y * width + at] += slopes[c * wide_area + y * pitch + at];
+    for (int side = 0; side < 4; side++) add_line(side, s, slopes, d_light, d_weight, d_x, d_image_x);
     for (int k = 0; k < 2; k++)
       for (int y = -ends[2]; y < height + ends[3]; y++) {
         const float *const from = slopes + (C + k) * wide_area + y * (ptrdiff_t)pitch;
-        float *const to = (k ? of_weight : of_x) + (size_t)std::clamp(y, 0, height - 1) * width;
+        float *const to = (k ? d_weight : d_x) + (size_t)std::clamp(y, 0, height - 1) * width;
         for (int at = 0; at < width; at++) to[at] += from[at];
         for (int at = -ends[0]; at < 0; at++) to[0] += from[at];
         for (int at = width; at < width + ends[1]; at++) to[width - 1] += from[at];
@@ -113,13 +131,14 @@ struct Frame {
   }
 
   // Adds the gradients by the pixels of a line.
-  void add_line(int side, int s, const float *slopes, float *of_light, float *of_weight, float *of_x, float *of_image_x) const {
+  void add_line(int side, int s, const float *slopes, float *d_light, float *d_weight, float *d_x,
+                float *d_image_x) const {
     const BorderLine line = line_of(side, s);
     const int n = length(side), sums = C + 1, added = ends[side ^ 2], *const beside = ends + (side & 2);
     const ptrdiff_t wide_step = place(side, 1, 0, pitch) - place(side, 0, 0, pitch);
     const int levels = Octave(added).levels();
     // gradients by the means of each level; each distance has half of the mean, and half of the nearest pixel
-    std::vector<float> of_means(levels * C * n), row(n);
+    std::vector<float> d_means(levels * C * n), row(n);
     for (int c = 0; c < C; c++)
       for (int distance = 1; distance <= added; distance++) {
         const Octave octave(distance);
@@ -127,48 +146,49 @@ struct Frame {
         for (int at = 0; at < n; at++) row[at] = beyond[at * wide_step];
         for (int k = 1; k <= beside[0]; k++) row[0] += beyond[-k * wide_step] * distance / (distance + k);
         for (int k = 1; k <= beside[1]; k++) row[n - 1] += beyond[(n - 1 + k) * wide_step] * distance / (distance + k);
-        float *const near = &of_means[(octave.level * C + c) * n], *const far = near + C * n;
+        float *const near = &d_means[(octave.level * C + c) * n], *const far = near + C * n;
         for (int at = 0; at < n; at++) near[at] += 0.5f * (1.0f - octave.part) * row[at];
         for (int at = 0; at < n; at++) far[at] += 0.5f * octave.part * row[at];
       }
 
     // gradients by the nearest pixels, by the values in the sums, and by places
-    std::vector<double> sum(n * sums), slope(n * sums), of_sum(n * sums), of_nearest(n * C), of_values(n * sums), of_places(n);
+    std::vector<double> sum(n * sums), slope(n * sums), d_sum(n * sums), d_nearest(n * C), d_values(n * sums),
+        d_places(n);
     std::vector<double> reversed(n);
     for (int at = 0; at < n; at++) reversed[at] = WindowSums::BINS - 1 - line.places[at];
     const WindowSums windows(n, sums, line.values.data(), line.places.data());
     for (int level = 0; level < levels; level++) {
       windows.sum(level, sum.data(), slope.data());
       for (int at = 0; at < n; at++) {
-        double *const of = &of_sum[at * sums], *const own = &sum[at * sums], total = own[C] > 0 ? own[C] : 1.0;
-        of[C] = 0;
+        double *const d = &d_sum[at * sums], *const own = &sum[at * sums], total = own[C] > 0 ? own[C] : 1.0;
+        d[C] = 0;
         for (int c = 0; c < C; c++) {
-          of_nearest[at * C + c] += of_means[(level * C + c) * n + at];
-          of[c] = of_means[(level * C + c) * n + at] / total;
-          if (own[C] > 0) of[C] -= of[c] * own[c] / total;
+          d_nearest[at * C + c] += d_means[(level * C + c) * n + at];
+          d[c] = d_means[(level * C + c) * n + at] / total;
+          if (own[C] > 0) d[C] -= d[c] * own[c] / total;
         }
-        for (int k = 0; k < sums; k++) of_places[at] += of[k] * slope[at * sums + k];
+        for (int k = 0; k < sums; k++) d_places[at] += d[k] * slope[at * sums + k];
       }
-      WindowSums(n, sums, of_sum.data(), reversed.data()).sum(level, sum.data(), slope.data());
+      WindowSums(n, sums, d_sum.data(), reversed.data()).sum(level, sum.data(), slope.data());
       for (int at = 0, k = 0; at < n; at++)
-        for (int end = k + sums; k < end; k++) of_values[k] += sum[k], of_places[at] -= line.values[k] * slope[k];
+        for (int end = k + sums; k < end; k++) d_values[k] += sum[k], d_places[at] -= line.values[k] * slope[k];
     }
 
     const size_t start = place(side, 0, 0, width), step = place(side, 1, 0, width) - start;
     for (int at = 0; at < n; at++) {
       const float *const pixel = light[s] + start + at * step, share = line.shares[at], peak = peak_of(pixel, area, C);
-      float *const of_pixel = of_light + start + at * step;
-      double of_its_weight = of_values[at * sums + C], of_share = 0;
+      float *const d_pixel = d_light + start + at * step;
+      double d_its_weight = d_values[at * sums + C], d_share = 0;
       for (int c = 0; c < C; c++) {
-        const double of_dimmed = of_nearest[at * C + c] + of_values[at * sums + c] * line.values[at * sums + C];
-        of_pixel[c * area] += (float)(of_dimmed * share);
-        of_share += of_dimmed * pixel[c * area];
-        of_its_weight += of_values[at * sums + c] * pixel[c * area] * share;
+        const double d_dimmed = d_nearest[at * C + c] + d_values[at * sums + c] * line.values[at * sums + C];
+        d_pixel[c * area] += (float)(d_dimmed * share);
+        d_share += d_dimmed * pixel[c * area];
+        d_its_weight += d_values[at * sums + c] * pixel[c * area] * share;
       }
-      if (share < 1) add_to_peak(pixel, area, C, peak, (float)-of_share * share / peak, of_pixel);
-      of_weight[start + at * step] += (float)of_its_weight;
+      if (share < 1) add_to_peak(pixel, area, C, peak, (float)-d_share * share / peak, d_pixel);
+      d_weight[start + at * step] += (float)d_its_weight;
     }
-    line.gradient(of_places.data(), step, of_x + start, of_image_x + start);
+    line.gradient(d_places.data(), step, d_x + start, d_image_x + start);
   }
 };
 
@@ -177,10 +197,22 @@ struct Frame {
 
 int32_t torchdof_continued(const float *const *maps, int32_t surfaces, int32_t channels, int32_t height, int32_t width,
                            const int32_t *ends, float low, float high, int32_t image, int32_t threads, float *out,
-                           const float *gradient, float *const *of_maps) {
+                           const float *gradient, float *const *d_maps) {
   return torchdof::guarded([&] {
-    const torchdof::Frame frame{maps, maps + surfaces, maps + 2 * surfaces, maps[3 * surfaces], surfaces, channels, height, width, ends, low, high, image, threads};
+    const torchdof::Frame frame{maps,
+                                maps + surfaces,
+                                maps + 2 * surfaces,
+                                maps[3 * surfaces],
+                                surfaces,
+                                channels,
+                                height,
+                                width,
+                                ends,
+                                low,
+                                high,
+                                image,
+                                threads};
     frame.find_positions();
-    gradient ? frame.gradient(gradient, of_maps) : frame.write(out);
+    gradient ? frame.gradient(gradient, d_maps) : frame.write(out);
   });
 }

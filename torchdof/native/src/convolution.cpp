@@ -1,5 +1,14 @@
 // Convolution with one kernel: four rows and two vectors of columns at a time, kept in registers.
-#include "engine.h"
+#include "convolution.h"
+
+#include <algorithm>
+#include <cmath>
+#include <cstring>
+#include <vector>
+
+#include "field_mask.h"
+#include "layers.h"
+#include "simd.h"
 
 namespace torchdof {
 namespace {
@@ -13,7 +22,8 @@ constexpr int SHORT = 10;  // half width up to which a single float32 sum is acc
 inline int stride_of(int half) { return 2 * half + 1 + 2 * (ROWS - 1); }
 
 template <bool SYMMETRIC, bool LONG>
-void rows_of(const float *in, int pitch, const uint32_t *rows, uint32_t columns, const Kernel &kernel, vec (&sum)[ROWS][VECTORS]) {
+void rows_of(const float *in, int pitch, const uint32_t *rows, uint32_t columns, const Kernel &kernel,
+             vec (&sum)[ROWS][VECTORS]) {
   const int half = kernel.half, stride = stride_of(half);
   for (int i = 0; i < ROWS + 2 * half; i++) {
     const int first = kernel.first[i], last = kernel.last[i];
@@ -115,12 +125,13 @@ void mask_kernel(const Layer &layer, int colour, const FieldMask &mask, Kernel &
     float *to = masked.taps.data() + column;
     float low = -half, high = half;
     if (layer.spots) mask.rows_of((float)-d, low, high);
-    const int start = (int)std::ceil(clamp(half - high, 0.0f, (float)side)), end = (int)std::floor(clamp(half - low, -1.0f, (float)(side - 1))) + 1;
+    const int start = (int)std::ceil(std::clamp(half - high, 0.0f, (float)side)),
+              end = (int)std::floor(std::clamp(half - low, -1.0f, (float)(side - 1))) + 1;
     for (int y = start; y < end; y += LANES) {
       const int n = std::min(LANES, end - y);
       vec taps = {};
       memcpy(&taps, from + y, n * sizeof(float));
-      taps *= mask.transmittance((float)(half - y) - counting(), all((float)-d));
+      taps *= mask.transmittance((float)(half - y) - iota(), broadcast((float)-d));
       left += taps;
       memcpy(to + y, &taps, n * sizeof(float));
     }
@@ -138,7 +149,8 @@ void mask_kernel(const Layer &layer, int colour, const FieldMask &mask, Kernel &
   find_rows(masked);
 }
 
-void convolve_strip(const float *in, int pitch, const uint32_t *rows, uint32_t columns, const Kernel &kernel, float *out) {
+void convolve_strip(const float *in, int pitch, const uint32_t *rows, uint32_t columns, const Kernel &kernel,
+                    float *out) {
   vec sum[ROWS][VECTORS] = {};
   if (kernel.symmetric && kernel.half <= SHORT)
     rows_of<true, false>(in, pitch, rows, columns, kernel, sum);

@@ -1,24 +1,37 @@
 // Disocclusion: fills the surfaces hidden behind a blurred foreground with light and depth of the farthest surfaces
 // around, as described in render/surfaces/disocclusion.py.
-#include "engine.h"
+#include "disocclusion.h"
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <vector>
+
+#include "blocks.h"
+#include "blur_axis.h"
+#include "highlights.h"
+#include "job.h"
+#include "memory.h"
 #include "rules.h"
+#include "simd.h"
+#include "surfaces.h"
 
 namespace torchdof {
 namespace {
 
 constexpr float FALL = constants::disocclusion::FALL;
 constexpr float SURE = constants::disocclusion::SURE;
-constexpr float LEAST_TOTAL = constants::disocclusion::LEAST_TOTAL;
 constexpr float MIXED = constants::disocclusion::MIXED;
 constexpr float HIDING_FROM_PX = constants::disocclusion::HIDING_FROM_PX;
-constexpr int BAND = 8;         // rows of a level computed together
-constexpr int CELL_LEVEL = 3;   // cells that may show hidden surfaces have the size of this level's samples
+constexpr int BAND = 8;        // rows of a level computed together
+constexpr int CELL_LEVEL = 3;  // cells that may show hidden surfaces have the size of this level's samples
 
 // One level of a pyramid of the farthest surfaces. A sample has `stride` values: light of each channel, coc, weight,
 // padding.
 struct Level {
   int height, width, step, stride, channels;
-  float vote;  // weight relative to other levels; 0: weights already contain it
+  float vote;      // weight relative to other levels; 0: weights already contain it
   float least_px;  // blur above which a pixel reads this level; in full from twice this blur
   Buffer<float> values;
   float centre_y, centre_x;  // centre of the image, in its pixels; the level has the same centre
@@ -27,6 +40,11 @@ struct Level {
   float *at(int y, int x) const { return values.data() + ((size_t)y * width + x) * stride; }
   float coc(int y, int x) const { return at(y, x)[channels]; }
 };
+
+// While hidden surfaces are filled, the sign of a second surface's weight gives its kind: minus for a hidden surface,
+// plus for one that matting found.
+inline vec as_hidden(vec weight) { return -weight; }
+inline bool is_hidden(float weight) { return weight < 0; }
 
 typedef float f8 __attribute__((vector_size(32)));
 constexpr int F8 = 8;
@@ -45,15 +63,15 @@ struct Place {
 };
 
 inline Place place_in(float at, int size) {
-  at = clamp(at, 0.0f, (float)(size - 1));
+  at = std::clamp(at, 0.0f, (float)(size - 1));
   const int before = std::min((int)at, std::max(0, size - 2));
   return {before, at - before};
 }
 
 // A level's sample behind a pixel.
 struct Sample {
-  float level_weight;       // of the level, for the pixel's blur, 0 to 1
-  float weight;             // of the samples that lie behind the pixel; 0 without them
+  float level_weight;      // of the level, for the pixel's blur, 0 to 1
+  float weight;            // of the samples that lie behind the pixel; 0 without them
   std::vector<f8> values;  // only valid with a weight
 
   // Reads the bilinear mean of the four samples around a position, without those in front of or at coc `here`.
@@ -67,14 +85,16 @@ struct Sample {
     const float *corners[4];
     float total = 0, counts[4];
     for (int k = 0; k < 4; k++) {
-      corners[k] = level.at(std::min(row.before + k / 2, level.height - 1), std::min(column.before + k % 2, level.width - 1));
+      corners[k] =
+          level.at(std::min(row.before + k / 2, level.height - 1), std::min(column.before + k % 2, level.width - 1));
       total += counts[k] = share[k] * corners[k][C + 1] * is_another_surface(corners[k][C] - end);
     }
     if (!(total > LEAST_SEEN)) return;
     weight = total;
     std::fill(values.begin(), values.end(), f8{});
     for (int k = 0; k < 4; k++)
-      for (size_t i = 0; i < values.size(); i++) values[i] += load<f8>(corners[k] + F8 * i) * (counts[k] * (1.0f / total));
+      for (size_t i = 0; i < values.size(); i++)
+        values[i] += load<f8>(corners[k] + F8 * i) * (counts[k] * (1.0f / total));
   }
 };
 
@@ -115,7 +135,8 @@ class Filling {
   // 3. Combine the levels behind cells of BEHIND_STEP pixels: the light behind all surfaces.
   // 4. Give each pixel of the cells found a second surface: the combined samples behind it.
   void run() {
-    const int levels = job_.levels, step = 2 << levels;  // padding of half a cell on each side; even sizes on every level
+    const int levels = job_.levels,
+              step = 2 << levels;  // padding of half a cell on each side; even sizes on every level
     area_height_ = ceil_div(job_.height + BEHIND_STEP, step) * step;
     area_width_ = ceil_div(job_.width + BEHIND_STEP, step) * step;
     coarsest_ = std::min(levels, CELL_LEVEL);
@@ -138,17 +159,19 @@ class Filling {
     found_.resize(cell_rows_ * cell_columns_);
     fine_.resize(found_.size());
     job_.parallel(ceil_div(pyramid_[0].height, BLOCK / 2), [&](int band, int) { finest(band); });
-    for (int i = 1; i < levels; i++) job_.parallel(ceil_div(pyramid_[i].height, BAND), [&](int band, int) { coarser(i, band); });
+    for (int i = 1; i < levels; i++)
+      job_.parallel(ceil_div(pyramid_[i].height, BAND), [&](int band, int) { coarser(i, band); });
     job_.parallel(cell_rows_, [&](int row, int) { find_cells(row); });
     fill();
-    // Until here hidden surfaces have negative weights, which distinguishes them from the second surfaces of mixed
-    // pixels. Small weights of the latter fall to 0, so that a hidden surface can take their place without a step.
+    // Small weights of mixed pixels' second surfaces fall to 0, so that a hidden surface can take their place without a
+    // step.
     job_.parallel((int)s_.blocks.size(), [&](int i, int) {
       if (!s_.has_block(i)) return;
       const Block b = s_.block(i);
       for (int at = 0; at < BLOCK_PIXELS; at++) {
-        const float mixed = b.weight[at], counted = std::max(mixed, 0.0f) * clamp01(mixed * (2.0f / HIDDEN_WEIGHT) - 1.0f);
-        b.weight[at] = mixed < 0 ? -mixed : counted;
+        const float mixed = b.weight[at],
+                    counted = std::max(mixed, 0.0f) * clamp01(mixed * (2.0f / HIDDEN_WEIGHT) - 1.0f);
+        b.weight[at] = is_hidden(mixed) ? -mixed : counted;
         b.own_weight[at] = b.own_weight[at] > 0 ? 1.0f - counted : 0.0f;
       }
     });
@@ -168,7 +191,8 @@ class Filling {
     const int H = job_.height, W = job_.width, planes = C_ + 2;
     const Level &level = pyramid_[0];
     const int top = first_pixel(H, level.height, 2), left = first_pixel(W, level.width, 2);
-    const int across = 2 * ceil_div(level.width, LANES) * LANES + BLOCK;  // whole vectors are read, whole blocks written
+    const int across =
+        2 * ceil_div(level.width, LANES) * LANES + BLOCK;  // whole vectors are read, whole blocks written
     const size_t line = (size_t)planes * across;
     // planes of the band's rows, extended to both sides and starting at pixel `left`: first copied from the image, then
     // replaced where there are blocks
@@ -178,7 +202,8 @@ class Filling {
     auto row_of = [&](int y) { return memory.data() + (std::clamp(y, 0, H - 1) - y0) * line; };
     for (int y = y0; y <= y1; y++) {
       float *const row = row_of(y) - left;
-      for (int c = 0; c < C_; c++) memcpy(row + c * across, s_.light + c * s_.area() + (size_t)y * W, W * sizeof(float));
+      for (int c = 0; c < C_; c++)
+        memcpy(row + c * across, s_.light + c * s_.area() + (size_t)y * W, W * sizeof(float));
       memcpy(row + C_ * across, s_.coc + (size_t)y * W, W * sizeof(float));
       std::fill(row + (C_ + 1) * across, row + (C_ + 1) * across + W, 1.0f);
     }
@@ -211,12 +236,14 @@ class Filling {
       const Block b = s_.block(which);
       float *coc = out + C * pitch, *weight = coc + pitch;
       for (int x = 0; x < BLOCK; x += LANES) {
-        const vec its = load<vec>(b.coc + first + x), mine = load<vec>(coc + x), share = load<vec>(b.weight + first + x);
-        const auto mixed = (share > all(MIXED)) & (its > mine);
+        const vec its = load<vec>(b.coc + first + x), mine = load<vec>(coc + x),
+                  share = load<vec>(b.weight + first + x);
+        const auto mixed = (share > MIXED) & (its > mine);
         store(coc + x, mixed ? its : mine);
         store(weight + x, mixed ? share : load<vec>(b.own_weight + first + x));
         for (int c = 0; c < C; c++)
-          store(out + c * pitch + x, mixed ? load<vec>(b.other + c * BLOCK_PIXELS + first + x) : load<vec>(b.own + c * BLOCK_PIXELS + first + x));
+          store(out + c * pitch + x, mixed ? load<vec>(b.other + c * BLOCK_PIXELS + first + x)
+                                           : load<vec>(b.own + c * BLOCK_PIXELS + first + x));
       }
       for (int x = 0; s_.valid && x < n; x++)
         if (!(s_.valid[(size_t)y * job_.width + x0 + x] > 0)) coc[x] = -NEVER;
@@ -224,8 +251,8 @@ class Filling {
     if (!bright) return;
     for (int x = 0; x < n; x += LANES) {
       vec peaks = load<vec>(out + x);
-      for (int c = 1; c < C; c++) peaks = most(peaks, load<vec>(out + c * pitch + x));
-      if (!any_of(peaks > all(least_limit))) continue;
+      for (int c = 1; c < C; c++) peaks = max(peaks, load<vec>(out + c * pitch + x));
+      if (!any_of(peaks > least_limit)) continue;
       for (int i = x; i < std::min(x + LANES, n); i++) {
         const float peak = peaks[i - x], limit = peak > least_limit ? threshold_at(job_, y, x0 + i) : peak;
         if (peak > limit)  // a hidden surface next to a highlight is not a highlight
@@ -254,22 +281,22 @@ class Filling {
       };
       read(C);
       vec farthest_coc = child[0];
-      for (int j = 1; j < count; j++) farthest_coc = most(farthest_coc, child[j]);
-      for (int j = 0; j < count; j++) counts[j] = all(1.0f) - is_another_surface(farthest_coc - child[j]);
+      for (int j = 1; j < count; j++) farthest_coc = max(farthest_coc, child[j]);
+      for (int j = 0; j < count; j++) counts[j] = 1.0f - is_another_surface(farthest_coc - child[j]);
       read(C + 1);
       for (int j = 0; j < count; j++) {
         const bool half_row = rows_count == 3 && j / COLUMNS != 1, half_column = COLUMNS == 3 && j % COLUMNS != 1;
         counts[j] *= 0.25f * (half_row ? 0.5f : 1.0f) * (half_column ? 0.5f : 1.0f) * child[j];
         total += counts[j];
       }
-      const vec each = all(1.0f) / most(total, all(LEAST_TOTAL));
+      const vec each = 1.0f / max(total, broadcast(LEAST_TOTAL));
       for (int i = 0; i < n; i++) store(out + (i + 1) * stride_ - F8, f8{});  // padding
       for (int k = 0; k <= C; k++) {
         read(k);
         vec sum = {};
         for (int j = 0; j < count; j++) sum += child[j] * counts[j];
         sum *= each;
-        put(k, k < C ? sum : total > vec{} ? sum : all(-NEVER));
+        put(k, k < C ? sum : total > vec{} ? sum : broadcast(-NEVER));
       }
       put(C + 1, total);
     }
@@ -286,10 +313,13 @@ class Filling {
           child[k] = fine.at(2 * y + k / 2, 2 * x + k % 2);
           farthest = std::max(farthest, child[k][C_]);
         }
-        for (int k = 0; k < 4; k++) total += counts[k] = child[k][C_ + 1] * (1.0f - is_another_surface(farthest - child[k][C_]));
+        for (int k = 0; k < 4; k++)
+          total += counts[k] = child[k][C_ + 1] * (1.0f - is_another_surface(farthest - child[k][C_]));
         total *= 0.25f;
         for (float &count : counts) count *= 0.25f / std::max(total, LEAST_TOTAL);
-        for (int c = 0; c <= C_; c++) out[c] = child[0][c] * counts[0] + child[1][c] * counts[1] + child[2][c] * counts[2] + child[3][c] * counts[3];
+        for (int c = 0; c <= C_; c++)
+          out[c] =
+              child[0][c] * counts[0] + child[1][c] * counts[1] + child[2][c] * counts[2] + child[3][c] * counts[3];
         if (!(total > 0)) out[C_] = -NEVER;
         out[C_ + 1] = total;
         std::fill(out + C_ + 2, out + stride_, 0.0f);
@@ -326,87 +356,41 @@ class Filling {
   }
 
   // Positions of pixels first, first + step, ... in a level.
-  static std::vector<Place> places(float first, int step, int count, int size, float (Level::*place)(float) const, const Level &level) {
+  static std::vector<Place> places(float first, int step, int count, int size, float (Level::*place)(float) const,
+                                   const Level &level) {
     std::vector<Place> at(count);
     for (int i = 0; i < count; i++) at[i] = place_in((level.*place)(first + (float)i * step), size);
     return at;
   }
 
-  // Steps 3 and 4 of `run`. The levels from FINE_LEVELS up are combined once for each cell of BEHIND_STEP pixels, and read like
-  // one level by the pixels.
+  // Steps 3 and 4 of `run`. The levels from FINE_LEVELS up are combined once for each cell of BEHIND_STEP pixels, and
+  // read like one level by the pixels.
   void fill() {
-    const int levels = job_.levels, H = job_.height, W = job_.width, C = C_;
-    const int rows = area_height_ / BEHIND_STEP, columns = area_width_ / BEHIND_STEP, coarse = std::max(levels - FINE_LEVELS, 0);
-    const int first_y = first_pixel(H, rows, BEHIND_STEP), first_x = first_pixel(W, columns, BEHIND_STEP);
+    const int levels = job_.levels, H = job_.height, W = job_.width;
+    const int rows = area_height_ / BEHIND_STEP, columns = area_width_ / BEHIND_STEP;
+    const int fine = std::min(levels, FINE_LEVELS), reads = fine + (levels > fine);
     job_.behind_height = rows;
     job_.behind_width = columns;
-    job_.behind.resize((size_t)C * rows * columns + 8);  // padding: eight values are read from any position
-    Level combined;  // mean of the coarse levels behind cells of BEHIND_STEP pixels
-    combined.height = rows;
-    combined.width = columns;
-    combined.step = BEHIND_STEP;
-    combined.stride = stride_;
-    combined.channels = C;
+    job_.behind.resize((size_t)C_ * rows * columns + 8);  // padding: eight values are read from any position
+    Level combined = {rows, columns, BEHIND_STEP, stride_, C_,
+                      0,    0,       {},          0,       0};  // mean of the coarse levels behind cells
     centre(combined);
-    combined.vote = 0;
-    if (coarse) {
+    if (levels > fine) {
       combined.least_px = pyramid_[FINE_LEVELS].least_px;
       combined.values = Buffer<float>((size_t)rows * columns * stride_);
     }
+    const float first_y = 0.5f * (H - 1) - 0.5f * (rows - 1) * BEHIND_STEP;
+    const float first_x = 0.5f * (W - 1) - 0.5f * (columns - 1) * BEHIND_STEP;
     std::vector<std::vector<Place>> ys, xs;  // positions of the cells in each level
     for (const Level &l : pyramid_) {
-      ys.push_back(places(0.5f * (H - 1) - 0.5f * (rows - 1) * BEHIND_STEP, BEHIND_STEP, rows, l.height, &Level::place_y, l));
-      xs.push_back(places(0.5f * (W - 1) - 0.5f * (columns - 1) * BEHIND_STEP, BEHIND_STEP, columns, l.width, &Level::place_x, l));
+      ys.push_back(places(first_y, BEHIND_STEP, rows, l.height, &Level::place_y, l));
+      xs.push_back(places(first_x, BEHIND_STEP, columns, l.width, &Level::place_x, l));
     }
-    const Level &base = pyramid_[std::min(levels, FINE_LEVELS) - 1];
-    std::vector<float> mean(C, 0.0f);  // mean light, for cells without valid pixels
-    if (s_.valid) {
-      std::vector<double> sums(C + 1, 0.0);
-      for (int row = 0; row < rows; row++)
-        for (int column = 0; column < columns; column++) {
-          const float *of = base.at(row, column), weight = of[C + 1];
-          if (!(weight > 0)) continue;
-          for (int c = 0; c < C; c++) sums[c] += (double)weight * of[c];
-          sums[C] += weight;
-        }
-      for (int c = 0; c < C; c++) mean[c] = (float)(sums[c] / std::max(sums[C], 1e-12));
-    }
-    job_.parallel(rows, [&](int row, int) {
-      std::vector<float> mean_behind(stride_);
-      std::vector<Sample> samples(levels, {0, 0, std::vector<f8>(stride_ / F8)});
-      for (int column = 0; column < columns; column++) {
-        const size_t at = (size_t)row * columns + column;
-        const float *light = base.at(row, column);
-        if (!(light[C + 1] > 0)) light = mean.data();
-        float *const coarse_mean = coarse ? combined.at(row, column) : nullptr;
-        if (coarse) memset(coarse_mean, 0, stride_ * sizeof(float));
-        const int top = first_y + row * BEHIND_STEP, left = first_x + column * BEHIND_STEP;
-        const int y0 = std::clamp(top, 0, H - 1), y1 = std::clamp(top + BEHIND_STEP - 1 + H % 2, 0, H - 1);
-        const int x0 = std::clamp(left, 0, W - 1), x1 = std::clamp(left + BEHIND_STEP - 1 + W % 2, 0, W - 1);
-        bool needed = false;
-        for (int r = y0 / cell_; r <= y1 / cell_; r++)
-          for (int c = x0 / cell_; c <= x1 / cell_; c++) needed |= found_[(size_t)r * cell_columns_ + c];
-        if (needed) {
-          needed = false;
-          float near = NEVER;
-          for (int y = y0; y <= y1; y++)
-            for (int x = x0; x <= x1; x++) {
-              near = std::min(near, s_.coc[(size_t)y * W + x]);
-              needed = needed || wanted(y, x);
-            }
-          if (needed) {
-            for (int i = 0; i < levels; i++) samples[i].read(pyramid_[i], ys[i][row], xs[i][column], near);
-            if (coarse) coarse_mean[C + 1] = mix(&pyramid_[FINE_LEVELS], &samples[FINE_LEVELS], coarse, false, coarse_mean);
-            if (mix(pyramid_.data(), samples.data(), levels, true, mean_behind.data()) > 0) light = mean_behind.data();
-          }
-        }
-        for (int c = 0; c < C; c++) job_.behind[(size_t)c * rows * columns + at] = light[c];
-      }
-    });
-    const int fine = std::min(levels, FINE_LEVELS), reads = fine + (coarse > 0);
+    const std::vector<float> mean = mean_light(pyramid_[fine - 1]);
+    job_.parallel(rows, [&](int row, int) { look_behind(row, ys, xs, mean, combined); });
     const Level *read[FINE_LEVELS + 1];  // by pixels: the fine levels, and the coarse ones combined
-    for (int i = 0; i < reads; i++) read[i] = i < fine ? &pyramid_[i] : &combined;
     for (int i = 0; i < reads; i++) {
+      read[i] = i < fine ? &pyramid_[i] : &combined;
       ys[i] = places(0, 1, H, read[i]->height, &Level::place_y, *read[i]);
       xs[i] = places(0, 1, W, read[i]->width, &Level::place_x, *read[i]);
     }
@@ -421,9 +405,71 @@ class Filling {
               found_fine |= fine_[(size_t)r * cell_columns_ + c];
             }
           to.first = found_fine ? 0 : fine;
-          if (found && to.first < reads) C == 3 ? fill_cell<3>(y, x, to) : fill_cell<0>(y, x, to);
+          if (found && to.first < reads) C_ == 3 ? fill_cell<3>(y, x, to) : fill_cell<0>(y, x, to);
         }
     });
+  }
+
+  // Mean light of a level, for cells without valid pixels; 0 if all pixels are valid.
+  std::vector<float> mean_light(const Level &level) const {
+    std::vector<float> mean(C_, 0.0f);
+    if (!s_.valid) return mean;
+    std::vector<double> sums(C_ + 1, 0.0);
+    for (int row = 0; row < level.height; row++)
+      for (int column = 0; column < level.width; column++) {
+        const float *sample = level.at(row, column), weight = sample[C_ + 1];
+        if (!(weight > 0)) continue;
+        for (int c = 0; c < C_; c++) sums[c] += (double)weight * sample[c];
+        sums[C_] += weight;
+      }
+    for (int c = 0; c < C_; c++) mean[c] = (float)(sums[c] / std::max(sums[C_], 1e-12));
+    return mean;
+  }
+
+  // A row of cells of BEHIND_STEP pixels: the light behind them, and the mean of the coarse levels in `combined`. ys,
+  // xs: positions of the cells in each level; mean: light of cells without valid pixels.
+  void look_behind(int row, const std::vector<std::vector<Place>> &ys, const std::vector<std::vector<Place>> &xs,
+                   const std::vector<float> &mean, const Level &combined) {
+    const int levels = job_.levels, C = C_, rows = combined.height, columns = combined.width;
+    const int coarse = std::max(levels - FINE_LEVELS, 0);
+    const Level &base = pyramid_[std::min(levels, FINE_LEVELS) - 1];
+    std::vector<float> mean_behind(stride_);
+    std::vector<Sample> samples(levels, {0, 0, std::vector<f8>(stride_ / F8)});
+    for (int column = 0; column < columns; column++) {
+      const float *light = base.at(row, column);
+      if (!(light[C + 1] > 0)) light = mean.data();
+      float *const coarse_mean = coarse ? combined.at(row, column) : nullptr;
+      if (coarse) memset(coarse_mean, 0, stride_ * sizeof(float));
+      float nearest;
+      if (is_wanted(row, column, rows, columns, nearest)) {
+        for (int i = 0; i < levels; i++) samples[i].read(pyramid_[i], ys[i][row], xs[i][column], nearest);
+        if (coarse) coarse_mean[C + 1] = mix(&pyramid_[FINE_LEVELS], &samples[FINE_LEVELS], coarse, false, coarse_mean);
+        if (mix(pyramid_.data(), samples.data(), levels, true, mean_behind.data()) > 0) light = mean_behind.data();
+      }
+      const size_t at = (size_t)row * columns + column;
+      for (int c = 0; c < C; c++) job_.behind[(size_t)c * rows * columns + at] = light[c];
+    }
+  }
+
+  // Whether a pixel of a cell of BEHIND_STEP pixels may show a hidden surface; nearest: smallest coc of the cell's
+  // pixels.
+  bool is_wanted(int row, int column, int rows, int columns, float &nearest) const {
+    const int H = job_.height, W = job_.width;
+    const int top = first_pixel(H, rows, BEHIND_STEP) + row * BEHIND_STEP;
+    const int left = first_pixel(W, columns, BEHIND_STEP) + column * BEHIND_STEP;
+    const int y0 = std::clamp(top, 0, H - 1), y1 = std::clamp(top + BEHIND_STEP - 1 + H % 2, 0, H - 1);
+    const int x0 = std::clamp(left, 0, W - 1), x1 = std::clamp(left + BEHIND_STEP - 1 + W % 2, 0, W - 1);
+    bool found = false, any = false;
+    for (int r = y0 / cell_; r <= y1 / cell_; r++)
+      for (int c = x0 / cell_; c <= x1 / cell_; c++) found |= found_[(size_t)r * cell_columns_ + c];
+    if (!found) return false;
+    nearest = NEVER;
+    for (int y = y0; y <= y1; y++)
+      for (int x = x0; x <= x1; x++) {
+        nearest = std::min(nearest, s_.coc[(size_t)y * W + x]);
+        any = any || wanted(y, x);
+      }
+    return any;
   }
 
   // The levels that the pixels of a cell read, and the positions of rows and columns in each.
@@ -433,9 +479,81 @@ class Filling {
     const std::vector<Place> *ys, *xs;
     int first = 0;
     // for each level and row around the cell: samples before and after each of the cell's columns
-    std::vector<vec> samples;
-    std::vector<float> lines;  // the same in the level's order
+    std::vector<vec> samples = {};
+    std::vector<float> lines = {};  // the same in the level's order
   };
+
+  // Copies the samples of level i around a cell so that the four around each of LANES pixels are vectors; returns the
+  // first row of samples.
+  static int copy_samples(CellLevels &to, int i, int y0, int x0, int rows, int columns, int planes, vec *out) {
+    constexpr int VECTORS = CELL / LANES;
+    const Level &level = *to.levels[i];
+    const Place *ys = &to.ys[i][y0], *xs = &to.xs[i][x0];
+    const int top = ys->before, bottom = std::min(ys[rows - 1].before + 1, level.height - 1), left = xs->before;
+    const int last = std::min(xs[columns - 1].before + 1, level.width - 1) - left;
+    ivec samples[2][VECTORS];
+    for (int x = 0; x < CELL; x++) {
+      const int before = xs[std::min(x, columns - 1)].before - left;
+      samples[0][x / LANES][x % LANES] = before;
+      samples[1][x / LANES][x % LANES] = std::min(before + 1, last);
+    }
+    float *line = to.lines.data();
+    for (int row = top; row <= bottom; row++, line += planes * CELL)
+      for (int x = 0; x <= last; x++)
+        for (int k = 0; k < planes; k++) line[k * CELL + x] = level.at(row, left + x)[k];
+    line = to.lines.data();
+    for (int row = top; row <= bottom; row++, line += planes * CELL)
+      for (int side = 0; side < 2; side++)
+        for (int k = 0; k < planes; k++)
+          for (int v = 0; v < VECTORS; v++) *out++ = lookup(line + k * CELL, samples[side][v]);
+    return top;
+  }
+
+  // Mean of the samples behind LANES pixels: vector v of row y of the cell at column x0, with the coc `here`. Returns
+  // the sum of the votes; mean: light and coc.
+  template <int CHANNELS>
+  vec mean_behind(const CellLevels &to, const int *first_rows, vec here, int y, int x0, int v, int columns,
+                  vec *mean) const {
+    constexpr int VECTORS = CELL / LANES, ROWS = CELL / 2 + 2;
+    const int C = CHANNELS ? CHANNELS : C_, planes = C + 2;
+    const size_t beside = (size_t)planes * VECTORS, below = 2 * beside, of_level = ROWS * below;
+    const vec size = max(here, -here);
+    const vec end = end_of_surface(here);
+    vec total = {};
+    for (int k = 0; k <= C; k++) mean[k] = vec{};
+    for (int i = to.first; i < to.count; i++) {
+      const Level &level = *to.levels[i];
+      const Place row = to.ys[i][y], *xs = &to.xs[i][x0];
+      const vec *corners[4];
+      corners[0] = &to.samples[i * of_level + (row.before - first_rows[i]) * below + v];
+      corners[1] = corners[0] + beside;
+      corners[2] = corners[0] + (level.height > 1 ? below : 0);
+      corners[3] = corners[2] + beside;
+      vec right, weight = {}, counts[4];
+      for (int x = 0; x < LANES; x++) right[x] = xs[std::min(v * LANES + x, columns - 1)].part;
+      const vec left = 1.0f - right,
+                shares[4] = {left * (1.0f - row.part), right * (1.0f - row.part), left * row.part, right * row.part};
+      for (int k = 0; k < 4; k++) {
+        const vec farther = is_another_surface(corners[k][C * VECTORS] - end);
+        weight += counts[k] = shares[k] * corners[k][(C + 1) * VECTORS] * farther;
+      }
+      const vec level_weight = is_read(size, level.least_px);
+      const ivec is_seen = (weight > LEAST_SEEN) & (level_weight > vec{});
+      if (!any_of(is_seen)) continue;
+      const vec voted = level.vote > 0 ? level.vote * min(weight * (1.0f / SURE), broadcast(1.0f)) : weight;
+      const vec vote = is_seen ? level_weight * voted : vec{};
+      total += vote;
+      const vec part = vote / max(total, broadcast(LEAST_TOTAL)), each = 1.0f / max(weight, broadcast(LEAST_SEEN));
+      for (vec &count : counts) count *= each;
+      for (int k = 0; k <= C; k++) {
+        const size_t plane = (size_t)k * VECTORS;
+        const vec sample = corners[0][plane] * counts[0] + corners[1][plane] * counts[1] +
+                           corners[2][plane] * counts[2] + corners[3][plane] * counts[3];
+        mean[k] += (sample - mean[k]) * part;
+      }
+    }
+    return total;
+  }
 
   // Fills the second surfaces of a cell: `behind` and `mix` for LANES pixels at once.
   //
@@ -445,88 +563,41 @@ class Filling {
   template <int CHANNELS>
   void fill_cell(int y0, int x0, CellLevels &to) {
     constexpr int VECTORS = CELL / LANES, ROWS = CELL / 2 + 2;
-    const int C = CHANNELS ? CHANNELS : C_, planes = C + 2, W = job_.width, which = y0 / BLOCK * s_.block_columns + x0 / BLOCK;
+    const int C = CHANNELS ? CHANNELS : C_, planes = C + 2, W = job_.width,
+              which = y0 / BLOCK * s_.block_columns + x0 / BLOCK;
     const int rows = std::min(CELL, job_.height - y0), columns = std::min(CELL, W - x0);
-    const size_t beside = (size_t)planes * VECTORS, below = 2 * beside, of_level = ROWS * below;
+    const size_t of_level = (size_t)2 * ROWS * planes * VECTORS;
     to.samples.resize(to.count * of_level + planes);
     to.lines.resize(ROWS * planes * CELL);
     vec *const mean = &to.samples[to.count * of_level];
     int first_rows[FINE_LEVELS + 1];
-    for (int i = to.first; i < to.count; i++) {
-      const Level &level = *to.levels[i];
-      const Place *ys = &to.ys[i][y0], *xs = &to.xs[i][x0];
-      const int bottom = std::min(ys[rows - 1].before + 1, level.height - 1), left = xs->before;
-      const int last = std::min(xs[columns - 1].before + 1, level.width - 1) - left;
-      first_rows[i] = ys->before;
-      ivec samples[2][VECTORS];
-      for (int x = 0; x < CELL; x++) {
-        samples[0][x / LANES][x % LANES] = xs[std::min(x, columns - 1)].before - left;
-        samples[1][x / LANES][x % LANES] = std::min(xs[std::min(x, columns - 1)].before - left + 1, last);
-      }
-      float *line = to.lines.data();
-      for (int row = first_rows[i]; row <= bottom; row++, line += planes * CELL)
-        for (int x = 0; x <= last; x++)
-          for (int k = 0; k < planes; k++) line[k * CELL + x] = level.at(row, left + x)[k];
-      vec *out = &to.samples[i * of_level];
-      line = to.lines.data();
-      for (int row = first_rows[i]; row <= bottom; row++, line += planes * CELL)
-        for (int side = 0; side < 2; side++)
-          for (int k = 0; k < planes; k++)
-            for (int v = 0; v < VECTORS; v++) *out++ = pick(line + k * CELL, samples[side][v]);
-    }
+    for (int i = to.first; i < to.count; i++)
+      first_rows[i] = copy_samples(to, i, y0, x0, rows, columns, planes, &to.samples[i * of_level]);
     for (int y = 0; y < rows; y++) {
       const int within = (y0 + y) % BLOCK * BLOCK + x0 % BLOCK;
       const float *here_of = s_.coc + (size_t)(y0 + y) * W + x0;
       float cut[CELL] = {};
       if (columns < CELL) here_of = (const float *)memcpy(cut, here_of, columns * sizeof(float));
       for (int v = 0; v < VECTORS; v++) {
-        const vec here = load<vec>(here_of + v * LANES), size = most(here, -here);
-        ivec wanted = size > all(HIDING_FROM_PX);
-        if (s_.has_block(which)) wanted &= load<vec>(s_.block(which).weight + within + v * LANES) < all(0.5f * HIDDEN_WEIGHT);
+        const vec here = load<vec>(here_of + v * LANES), size = max(here, -here);
+        ivec wanted = size > HIDING_FROM_PX;
+        if (s_.has_block(which))
+          wanted &= load<vec>(s_.block(which).weight + within + v * LANES) < broadcast(0.5f * HIDDEN_WEIGHT);
         if (!any_of(wanted)) continue;
-        const vec end = end_of_surface(here);
-        vec total = {};
-        for (int k = 0; k <= C; k++) mean[k] = vec{};
-        for (int i = to.first; i < to.count; i++) {
-          const Level &level = *to.levels[i];
-          const Place row = to.ys[i][y0 + y], *xs = &to.xs[i][x0];
-          const vec *corners[4];
-          corners[0] = &to.samples[i * of_level + (row.before - first_rows[i]) * below + v];
-          corners[1] = corners[0] + beside;
-          corners[2] = corners[0] + (level.height > 1 ? below : 0);
-          corners[3] = corners[2] + beside;
-          vec right, weight = {}, counts[4];
-          for (int x = 0; x < LANES; x++) right[x] = xs[std::min(v * LANES + x, columns - 1)].part;
-          const vec left = all(1.0f) - right, shares[4] = {left * (1.0f - row.part), right * (1.0f - row.part), left * row.part, right * row.part};
-          for (int k = 0; k < 4; k++) {
-            const vec farther = is_another_surface(corners[k][C * VECTORS] - end);
-            weight += counts[k] = shares[k] * corners[k][(C + 1) * VECTORS] * farther;
-          }
-          const vec level_weight = is_read(size, level.least_px);
-          const ivec is_seen = (weight > all(LEAST_SEEN)) & (level_weight > vec{});
-          if (!any_of(is_seen)) continue;
-          const vec voted = level.vote > 0 ? level.vote * least(weight * (1.0f / SURE), all(1.0f)) : weight;
-          const vec vote = is_seen ? level_weight * voted : vec{};
-          total += vote;
-          const vec part = vote / most(total, all(LEAST_TOTAL)), each = all(1.0f) / most(weight, all(LEAST_SEEN));
-          for (vec &count : counts) count *= each;
-          for (int k = 0; k <= C; k++) {
-            const size_t plane = (size_t)k * VECTORS;
-            const vec sample = corners[0][plane] * counts[0] + corners[1][plane] * counts[1] + corners[2][plane] * counts[2] + corners[3][plane] * counts[3];
-            mean[k] += (sample - mean[k]) * part;
-          }
-        }
+        const vec total = mean_behind<CHANNELS>(to, first_rows, here, y0 + y, x0, v, columns, mean);
         wanted &= total > vec{};
         if (!any_of(wanted)) continue;
         // replaces a second surface to which matting gave a small weight
         const Block b = s_.make_block(which);
         const size_t at = within + v * LANES;
-        const vec mixed = load<vec>(b.weight + at), hidden = least(total * (1.0f / CERTAIN), all(1.0f)) * (2.0f * mixed - HIDDEN_WEIGHT);
+        const vec mixed = load<vec>(b.weight + at), certain = min(total * (1.0f / CERTAIN), broadcast(1.0f));
+        const vec hidden = as_hidden(certain * (HIDDEN_WEIGHT - 2.0f * mixed));
         auto replace = [&](float *other, vec hidden_one) { store(other, wanted ? hidden_one : load<vec>(other)); };
         for (int c = 0; c < C; c++) replace(b.other + c * BLOCK_PIXELS + at, mean[c]);
         replace(b.coc + at, mean[C]);
-        vec valid = all(1.0f);
-        for (int x = 0; s_.valid && x < std::min(LANES, columns - v * LANES); x++) valid[x] = s_.valid[(size_t)(y0 + y) * W + x0 + v * LANES + x];
+        vec valid = broadcast(1.0f);
+        for (int x = 0; s_.valid && x < std::min(LANES, columns - v * LANES); x++)
+          valid[x] = s_.valid[(size_t)(y0 + y) * W + x0 + v * LANES + x];
         store(b.weight + at, wanted ? hidden * valid : mixed);
       }
     }

@@ -4,16 +4,30 @@
 // second). The means of weight w and light, and of w t and light t, over the pixels between each two nodes are
 // therefore enough: the layer at the first node takes mean(w) - mean(w t), the one at the second takes mean(w t).
 // In the code, `sums` are without t, and `sums_behind` with t: of the parts that lie behind the first node.
-#include "engine.h"
+#include "downsampling.h"
+
+#include <algorithm>
+#include <cstdint>
+#include <cstring>
+#include <vector>
+
+#include "blocks.h"
+#include "border.h"
+#include "job.h"
+#include "layers.h"
+#include "memory.h"
 #include "rules.h"
+#include "simd.h"
+#include "surfaces.h"
 
 namespace torchdof {
 
 class Downsampling {
  public:
   Downsampling(const Job &job, const LayerIndex &index, const Border &border, Downsampled &to)
-      : job_(job), s_(job.surfaces), index_(index), border_(border), over_(job.scene.occlusion), to_(to), C_(job.channels), stride_(to.stride()), each_(1.0f / (to.scale * to.scale)),
-        light_(C_), light_of_{light_, light_}, beyond_((size_t)2 * C_ * BLOCK_PIXELS) {}
+      : job_(job), s_(job.surfaces), index_(index), border_(border), over_(job.scene.occlusion), to_(to),
+        C_(job.channels), stride_(to.stride()), each_(1.0f / (to.scale * to.scale)), light_(C_),
+        light_of_{light_, light_}, beyond_((size_t)2 * C_ * BLOCK_PIXELS) {}
 
   // Computes all blocks of a band of BLOCK rows of pixels.
   void band(int band) {
@@ -70,7 +84,8 @@ class Downsampling {
     vec far[S][PARTS], sums[PARTS], sums_behind[PARTS] = {};
     for (int y = 0; y < S; y++)
       for (int p = 0; p < PARTS; p++)
-        sums_behind[p] += far[y][p] = behind(job_.layers[k], index_.place(load<vec>(coc + y * s_.width + p * LANES)), over_);
+        sums_behind[p] += far[y][p] =
+            behind(job_.layers[k], index_.place(load<vec>(coc + y * s_.width + p * LANES)), over_);
     put(C_ + 2, sums_behind);
     for (int c = 0; c < C_; c++) {
       for (int p = 0; p < PARTS; p++) sums[p] = sums_behind[p] = vec{};
@@ -85,8 +100,8 @@ class Downsampling {
     }
   }
 
-  // Computes the blocks of a row from `column` to the end of their cell (or larger block), at most to `end`: one interval
-  // at a time, whole vectors of pixels. Returns the next column.
+  // Computes the blocks of a row from `column` to the end of their cell (or larger block), at most to `end`: one
+  // interval at a time, whole vectors of pixels. Returns the next column.
   template <int S>
   int cell(int row, int column, int end, Pieces &pieces) {
     constexpr int WIDTH = S > CELL ? S : CELL, COUNT = WIDTH / S;
@@ -116,7 +131,7 @@ class Downsampling {
           halves of_row;
           memcpy(&of_row, intervals + x, sizeof(of_row));
           store(interval_[there] + i, __builtin_convertvector(of_row, ivec));
-          store(weight_[there] + i, weight ? load<vec>(weight + y * BLOCK + x) : all(1.0f));
+          store(weight_[there] + i, weight ? load<vec>(weight + y * BLOCK + x) : broadcast(1.0f));
           store(coc_[there] + i, load<vec>(coc + x));
         }
     }
@@ -124,10 +139,12 @@ class Downsampling {
     const size_t light_step = !inside ? WIDTH : s_.has_block(s_.block_of(y0, x0)) ? BLOCK : s_.width;
     cell_nodes_.clear();
     for (int i = 0; i < there; i++)
-      continues ? sum_intervals<S, true>(i, light_step, before_[i], after_[i]) : sum_intervals<S, false>(i, light_step, weight_[i], weight_[i]);
+      continues ? sum_intervals<S, true>(i, light_step, before_[i], after_[i])
+                : sum_intervals<S, false>(i, light_step, weight_[i], weight_[i]);
     for (int i = 0; continues && i < (int)corrections_.size(); i++) {
       const NormalizerCorrection &of = corrections_[i];
-      float *sums = &cell_sums_[cell_sums_of(to_.stands_for[of.node] | Pieces::NORMALIZER_ONLY, COUNT)] + of.pixel % WIDTH / S;
+      float *sums =
+          &cell_sums_[cell_sums_of(to_.stands_for[of.node] | Pieces::NORMALIZER_ONLY, COUNT)] + of.pixel % WIDTH / S;
       sums[0] += of.up_to * each_;
       sums[(C_ + 1) * COUNT] += of.next * each_;
     }
@@ -150,8 +167,9 @@ class Downsampling {
     return end;
   }
 
-  // Reads blocks of a cell that lies at least partly beyond the frame; the others get the weight 0. Beside one edge of the
-  // frame coc and weight do not change away from it, and the pixels of a line get its mean light. False if all weights are 0.
+  // Reads blocks of a cell that lies at least partly beyond the frame; the others get the weight 0. Beside one edge of
+  // the frame coc and weight do not change away from it, and the pixels of a line get its mean light. False if all
+  // weights are 0.
   template <int S>
   bool read_beyond(int surface, int y0, int x0, int first, int last) {
     constexpr int WIDTH = S > CELL ? S : CELL;
@@ -204,14 +222,14 @@ class Downsampling {
   void sum_intervals(int surface, size_t light_step, const float *before, const float *after) {
     constexpr int WIDTH = S > CELL ? S : CELL, PARTS = WIDTH / LANES, COUNT = WIDTH / S, DONE = -1;
     const int C = C_;
-    vec place[S][PARTS], share[S][PARTS], part[S][PARTS];
+    vec place[S][PARTS], share[S][PARTS], part[S][PARTS] = {};
     ivec interval[S][PARTS], last = ivec{} + DONE;
     for (int y = 0; y < S; y++)
       for (int p = 0; p < PARTS; p++) {
         const int i = y * WIDTH + p * LANES;
         place[y][p] = index_.place(load<vec>(coc_[surface] + i));
         interval[y][p] = load<vec>(weight_[surface] + i) != vec{} ? load<ivec>(interval_[surface] + i) : ivec{} + DONE;
-        last = most(last, interval[y][p]);
+        last = max(last, interval[y][p]);
       }
     for (;;) {
       int k = DONE;
@@ -226,13 +244,14 @@ class Downsampling {
           const vec first = its ? load<vec>(before + i) : vec{};
           share[y][p] = first;
           if (to_.wanted[k]) {
-            const vec far = behind(job_.layers[k], place[y][p], over_), second = MIXED ? its ? load<vec>(after + i) : vec{} : first;
+            const vec far = behind(job_.layers[k], place[y][p], over_),
+                      second = MIXED ? its ? load<vec>(after + i) : vec{} : first;
             if (MIXED) share[y][p] += far * (second - first);
             sums_behind[p] += part[y][p] = far * second;
           }
           sums[p] += share[y][p];
           interval[y][p] = its ? ivec{} + DONE : interval[y][p];
-          last = most(last, interval[y][p]);
+          last = max(last, interval[y][p]);
         }
       if (!to_.needed(k)) continue;
       const size_t start = cell_sums_of(to_.stands_for[k], COUNT);
@@ -260,7 +279,8 @@ class Downsampling {
 
   // Index of a node's sums [stride, count]; adds them if they are missing.
   size_t cell_sums_of(int node, int count) {
-    const size_t size = (size_t)stride_ * count, i = std::find(cell_nodes_.begin(), cell_nodes_.end(), node) - cell_nodes_.begin();
+    const size_t size = (size_t)stride_ * count,
+                 i = std::find(cell_nodes_.begin(), cell_nodes_.end(), node) - cell_nodes_.begin();
     if (i == cell_nodes_.size()) {
       cell_nodes_.push_back(node);
       cell_sums_.resize(std::max(cell_sums_.size(), (i + 1) * size));
@@ -299,7 +319,8 @@ class Downsampling {
       const vec weight[2] = {load<vec>(weight_[0] + i), load<vec>(weight_[1] + i)};
       const auto other_is_nearer = load<vec>(coc_[1] + i) < load<vec>(coc_[0] + i);
       const vec share = other_is_nearer ? weight[0] : weight[1], extra = continuation(share), whole = share + extra;
-      for (int surface = 0; surface < 2; surface++) store(before_[surface] + i, weight[surface]), store(after_[surface] + i, weight[surface]);
+      for (int surface = 0; surface < 2; surface++)
+        store(before_[surface] + i, weight[surface]), store(after_[surface] + i, weight[surface]);
       if (!any_positive(extra)) continue;
       any = true;
       const vec fars[2] = {far_between(0, i), far_between(1, i)};
@@ -339,14 +360,15 @@ class Downsampling {
   float coc_[2][BLOCK_PIXELS], weight_[2][BLOCK_PIXELS], before_[2][BLOCK_PIXELS], after_[2][BLOCK_PIXELS];
   int32_t interval_[2][BLOCK_PIXELS];
   std::vector<NormalizerCorrection> corrections_;
-  std::vector<int> cell_nodes_;    // nodes in a row of blocks,
+  std::vector<int> cell_nodes_;   // nodes in a row of blocks,
   std::vector<float> cell_sums_;  // and their values in the layout of pieces [nodes, stride, blocks]
   std::vector<const float *> light_, light_of_[2];
   std::vector<float> beyond_;  // light of pixels in a cell beyond the frame [2, channels, BLOCK_PIXELS]
 };
 
 Downsampled::Downsampled(const Job &job, int scale, int margin)
-    : scale(scale), margin(margin), rows(ceil_div(job.height, scale)), columns(ceil_div(job.width, scale)), channels(job.channels) {
+    : scale(scale), margin(margin), rows(ceil_div(job.height, scale)), columns(ceil_div(job.width, scale)),
+      channels(job.channels) {
   const int per_band = BLOCK / scale;
   pitch = (columns + 2 * margin + 15) / 16 * 16 + 32;  // rows are read in whole vectors
   size = (size_t)(rows + 2 * margin) * pitch;
@@ -376,7 +398,8 @@ void Downsampled::take(const Job &job, const LayerIndex &index, const Border &bo
   for (int row = 0; row < index.rows; row++)
     for (int column = 0; column < index.columns; column++)
       for (int w = 0; w < index.words; w++)
-        if (index.cell((size_t)row * index.columns + column)[w] & layers[w]) occupied[(size_t)(row / cells) * block_columns + column / cells] = 1;
+        if (index.cell((size_t)row * index.columns + column)[w] & layers[w])
+          occupied[(size_t)(row / cells) * block_columns + column / cells] = 1;
   const int reach = ceil_div(2 * margin * scale, BLOCK);
   auto widen = [](const uint8_t *from, uint8_t *to, int count, int step, int reach) {
     for (int i = 0, last = -reach - 1; i < count + reach; i++) {  // last: latest occupied index up to i
@@ -385,10 +408,13 @@ void Downsampled::take(const Job &job, const LayerIndex &index, const Border &bo
     }
   };
   near.resize(occupied.size());
-  for (int row = 0; row < block_rows; row++) widen(&occupied[(size_t)row * block_columns], &near[(size_t)row * block_columns], block_columns, 1, reach);
+  for (int row = 0; row < block_rows; row++)
+    widen(&occupied[(size_t)row * block_columns], &near[(size_t)row * block_columns], block_columns, 1, reach);
   occupied.swap(near);
-  for (int column = 0; column < block_columns; column++) widen(&occupied[column], &near[column], block_rows, block_columns, reach);
-  job.parallel((int)pieces.size(), [&](int band, int) { Downsampling(job, index, border, *this).band(first_band + band); });
+  for (int column = 0; column < block_columns; column++)
+    widen(&occupied[column], &near[column], block_rows, block_columns, reach);
+  job.parallel((int)pieces.size(),
+               [&](int band, int) { Downsampling(job, index, border, *this).band(first_band + band); });
 }
 
 }  // namespace torchdof

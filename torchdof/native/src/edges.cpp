@@ -2,10 +2,20 @@
 //
 // The frame is processed in tiles of AREA x AREA pixels, and within a tile only where the map changes. Each tile is
 // copied with a margin, padded beyond the frame with the nearest border pixel, so that loops run in whole vectors.
+#include <algorithm>
 #include <array>
+#include <cmath>
+#include <cstdint>
+#include <cstdlib>
+#include <cstring>
+#include <vector>
 
+#include "api.h"
 #include "constants/edges.h"
-#include "engine.h"
+#include "entry.h"
+#include "memory.h"
+#include "simd.h"
+#include "threads.h"
 
 namespace torchdof {
 namespace {
@@ -72,21 +82,23 @@ constexpr float LARGEST = constants::edges::LARGEST;
 constexpr float BRIGHTEST = constants::edges::BRIGHTEST;
 constexpr int KINDS = DIRECTIONS * PLACES;
 
-constexpr int AREA = 96;       // side of a tile in pixels
+constexpr int AREA = 96;  // side of a tile in pixels
 // A pixel's result depends on the pixels within this many of it: without ramps, and with ramps.
 constexpr int STEP_HALO = RINGS + REACH, HALO = RINGS + RAMP_REACH + FLAT_REACH + 3;
 constexpr float NO_SCORE = 100.0f;  // marks pixels without a score; above all scores
 constexpr int NEIGHBOURS[8][2] = {{-1, -1}, {-1, 0}, {-1, 1}, {0, -1}, {0, 1}, {1, -1}, {1, 0}, {1, 1}};
 constexpr float FINITE = 3.402823466e38f;
 // Vectors of a window of SIDE x SIDE pixels: first WHOLE columns of each row, then the remaining 4 columns.
-constexpr int SIDE = 2 * REACH + 1, WHOLE = SIDE / LANES * LANES, ROWS_AT_ONCE = LANES / 4, WINDOW = SIDE * WHOLE / LANES + (SIDE + ROWS_AT_ONCE - 1) / ROWS_AT_ONCE;
+constexpr int SIDE = 2 * REACH + 1, WHOLE = SIDE / LANES * LANES, ROWS_AT_ONCE = LANES / 4,
+              WINDOW = SIDE * WHOLE / LANES + (SIDE + ROWS_AT_ONCE - 1) / ROWS_AT_ONCE;
 static_assert(SIDE - WHOLE <= 4 && WHOLE > REACH + 1);
 
 // Bits of a pixel's mark. NEAR: the map gives it the near surface's depth. Bits from UNSURE up: index into SURE.
 constexpr uint8_t EDGE = 1, RAMP = 2, NEAR = 4, LISTED = 8, UNSURE = 32;
 // weight as a colour reference: far from steps, RINGS pixels from one, ..., beside one; 0 for invalid pixels and ramps
 using constants::edges::SURE;
-constexpr float SURE_OF[256 / UNSURE] = {(float)SURE[4], (float)SURE[3], (float)SURE[2], (float)SURE[1], (float)SURE[0]};
+constexpr float SURE_OF[256 / UNSURE] = {(float)SURE[4], (float)SURE[3], (float)SURE[2], (float)SURE[1],
+                                         (float)SURE[0]};
 
 // A rectangle in the coordinates of the frame; may reach beyond the frame.
 struct Part {
@@ -109,7 +121,8 @@ struct Edge {
 class Grid : public Part {
  public:
   explicit Grid(const Part &part, int planes = 1)
-      : Part(part), pitch((part.width + LANES - 1) / LANES * LANES + 2 * LANES), size((size_t)part.height * pitch), data_(size * planes + LANES) {
+      : Part(part), pitch((part.width + LANES - 1) / LANES * LANES + 2 * LANES), size((size_t)part.height * pitch),
+        data_(size * planes + LANES) {
     std::fill(&data_[size * planes], &data_[size * planes] + LANES, 0.0f);
   }
 
@@ -129,7 +142,8 @@ template <typename Look>
 inline void each_of_window(const Look &look) {
   int n = 0;
   for (int v = 0; v < SIDE; v++)
-    for (int u = 0; u < WHOLE; u += LANES) look(n++, [v, u](const float *p, int pitch) { return load<vec>(p + v * pitch + u); });
+    for (int u = 0; u < WHOLE; u += LANES)
+      look(n++, [v, u](const float *p, int pitch) { return load<vec>(p + v * pitch + u); });
   for (int v = 0; v + ROWS_AT_ONCE <= SIDE; v += ROWS_AT_ONCE)
     look(n++, [v](const float *p, int pitch) {
       p += v * pitch + WHOLE;
@@ -148,7 +162,8 @@ std::vector<float> window(const Of &of) {
   std::vector<float> values(WINDOW * LANES, 0.0f);
   for (int v = 0; v < SIDE; v++)
     for (int u = 0; u < SIDE; u++)
-      values[u < WHOLE ? v * WHOLE + u : SIDE * WHOLE + 4 * v + u - WHOLE] = of((float)((v - REACH) * (v - REACH) + (u - REACH) * (u - REACH)));
+      values[u < WHOLE ? v * WHOLE + u : SIDE * WHOLE + 4 * v + u - WHOLE] =
+          of((float)((v - REACH) * (v - REACH) + (u - REACH) * (u - REACH)));
   return values;
 }
 
@@ -165,24 +180,28 @@ void max_filter(const Grid &in, const Grid &out, const Grid &rows, const Part &p
   constexpr int TAPS = 2 * REACH_ + 1, RUN = (TAPS + 2) / 3, LAST = TAPS - RUN, MIDDLE = LAST / 2;
   const auto run = [](const float *from, int stride) {
     vec high = load<vec>(from);
-    for (int d = 1; d < RUN; d++) high = most(high, load<vec>(from + d * stride));
+    for (int d = 1; d < RUN; d++) high = max(high, load<vec>(from + d * stride));
     return high;
   };
   const auto three = [](const float *from, int stride) {
-    return most(load<vec>(from), most(load<vec>(from + MIDDLE * stride), load<vec>(from + LAST * stride)));
+    return max(load<vec>(from), max(load<vec>(from + MIDDLE * stride), load<vec>(from + LAST * stride)));
   };
   for (int y = part.y0 - REACH_; y < part.bottom() + REACH_; y++) {
-    for (int x = part.x0; RUN > 1 && x < part.right() + LAST; x += LANES) store(rows.at(y, x), run(in.at(y, x - REACH_), 1));
-    for (int x = part.x0; x < part.right(); x += LANES) store(rows.at(y, x), three(RUN > 1 ? rows.at(y, x) : in.at(y, x - REACH_), 1));
+    for (int x = part.x0; RUN > 1 && x < part.right() + LAST; x += LANES)
+      store(rows.at(y, x), run(in.at(y, x - REACH_), 1));
+    for (int x = part.x0; x < part.right(); x += LANES)
+      store(rows.at(y, x), three(RUN > 1 ? rows.at(y, x) : in.at(y, x - REACH_), 1));
   }
-  each_vector({part.y0 - REACH_, part.x0, RUN > 1 ? part.height + LAST : 0, part.width}, [&](int y, int x) { store(rows.at(y, x), run(rows.at(y, x), rows.pitch)); });
+  each_vector({part.y0 - REACH_, part.x0, RUN > 1 ? part.height + LAST : 0, part.width},
+              [&](int y, int x) { store(rows.at(y, x), run(rows.at(y, x), rows.pitch)); });
   each_vector(part, [&](int y, int x) { store(out.at(y, x), three(rows.at(y - REACH_, x), rows.pitch)); });
 }
 
 // Maximum over 3 x 3 values around each value of a vector.
 inline vec max_3x3(const float *from, int pitch) {
-  vec high = most(load<vec>(from), most(load<vec>(from - 1), load<vec>(from + 1)));
-  for (const float *row : {from - pitch, from + pitch}) high = most(high, most(load<vec>(row), most(load<vec>(row - 1), load<vec>(row + 1))));
+  vec high = max(load<vec>(from), max(load<vec>(from - 1), load<vec>(from + 1)));
+  for (const float *row : {from - pitch, from + pitch})
+    high = max(high, max(load<vec>(row), max(load<vec>(row - 1), load<vec>(row + 1))));
   return high;
 }
 
@@ -194,7 +213,8 @@ void sums(const Grid &in, const Grid &out, const Grid &rows, const Part &part, f
     for (int d = 1; d <= REACH_; d++) total += load<vec>(middle - d * stride) + load<vec>(middle + d * stride);
     return total;
   };
-  each_vector({part.y0 - REACH_, part.x0, part.height + 2 * REACH_, part.width}, [&](int y, int x) { store(rows.at(y, x), sum(in.at(y, x), 1)); });
+  each_vector({part.y0 - REACH_, part.x0, part.height + 2 * REACH_, part.width},
+              [&](int y, int x) { store(rows.at(y, x), sum(in.at(y, x), 1)); });
   each_vector(part, [&](int y, int x) { store(out.at(y, x), sum(rows.at(y, x), rows.pitch) * factor); });
 }
 
@@ -211,10 +231,10 @@ struct Around {
 // Edge pixels of a part, in row order.
 struct Group {
   Part part;
-  std::vector<Edge> edges;
-  Part bounds = {};               // bounding box of the edges
-  std::vector<Judgement> judged;  // one for each edge
-  std::vector<Around> around;     // one for every LANES edges
+  std::vector<Edge> edges = {};
+  Part bounds = {};                    // bounding box of the edges
+  std::vector<Judgement> judged = {};  // one for each edge
+  std::vector<Around> around = {};     // one for every LANES edges
 };
 
 // Selects edge pixels by kind: first those to which the map gives the far surface, then those with the near one.
@@ -231,7 +251,8 @@ struct EdgeSums {
 class Repair {
  public:
   explicit Repair(const torchdof_map &map)
-      : map_(map), sign_(map.of_coc ? -1.0f : 1.0f), height_(map.height), width_(map.width), channels_(map.channels), area_((size_t)map.height * map.width), score_(area_), evidence_(area_), marks_(area_) {}
+      : map_(map), sign_(map.is_coc ? -1.0f : 1.0f), height_(map.height), width_(map.width), channels_(map.channels),
+        area_((size_t)map.height * map.width), score_(area_), evidence_(area_), marks_(area_) {}
 
   // 1. Find the edges of a sample of the frame, see whether the map is soft, and decide by colour which surface each
   //    pixel shows.
@@ -242,7 +263,8 @@ class Repair {
   bool run() {
     noise_step_ = NOISES * noise();
     const int every = (int)std::ceil(std::sqrt((double)area_ / SAMPLED));
-    const bool finds_twice = map_.automatic && every > 4;  // the sample is a small part of the frame: find only its edges first
+    const bool finds_twice =
+        map_.automatic && every > 4;  // the sample is a small part of the frame: find only its edges first
     const auto is_sampled = [&](int y, int x) { return (block_of(y, height_) + block_of(x, width_)) % every == 0; };
     std::vector<Group> groups, sampled;
     KindMask all_kinds;
@@ -287,9 +309,13 @@ class Repair {
   // Kind of an edge pixel, plus KINDS if the map gives it the near surface: an index into a KindMask.
   int given_kind_of(const Edge &edge) const { return edge.kind + (marks_[edge.i] & NEAR ? KINDS : 0); }
   // Share of the pixels of a given kind to which the map gives the wrong surface.
-  float wrong(int given_kind) const { return given_kind >= KINDS ? 1.0f - shares_[given_kind - KINDS] : shares_[given_kind]; }
+  float wrong(int given_kind) const {
+    return given_kind >= KINDS ? 1.0f - shares_[given_kind - KINDS] : shares_[given_kind];
+  }
   static float valid(float v) { return std::fabs(v) <= LARGEST ? v : 0.0f; }
-  static float root(float light) { return (light <= FINITE) & (light > 0) ? std::sqrt(std::min(light, BRIGHTEST)) : 0.0f; }
+  static float root(float light) {
+    return (light <= FINITE) & (light > 0) ? std::sqrt(std::min(light, BRIGHTEST)) : 0.0f;
+  }
 
   // Standard deviation of the map's noise, from the median second difference along rows or columns, whichever is
   // larger. At least the noise of rounding, if the map has more than LEVELS_OF_A_FILE levels; their distance is the
@@ -336,7 +362,8 @@ class Repair {
     for (const Group &group : sampled)
       each_edge(group, [&](size_t, const Edge &edge, int y, int x) {
         const float *value = map_.nearness + edge.i;
-        length += climb(value, x > 0 ? -1 : 0, x < width_ - 1 ? 1 : 0, y > 0 ? -width_ : 0, y < height_ - 1 ? width_ : 0, std::max(edge.near - edge.far, 1e-12f));
+        length += climb(value, x > 0 ? -1 : 0, x < width_ - 1 ? 1 : 0, y > 0 ? -width_ : 0,
+                        y < height_ - 1 ? width_ : 0, std::max(edge.near - edge.far, 1e-12f));
       });
     return ramps > WIDE * length || mixed > MIXED * ramps;
   }
@@ -372,7 +399,8 @@ class Repair {
   std::vector<Group> tiles() const {
     std::vector<Group> parts;
     for (int y = 0; y < height_; y += AREA)
-      for (int x = 0; x < width_; x += AREA) parts.push_back({{y, x, std::min(AREA, height_ - y), std::min(AREA, width_ - x)}, {}});
+      for (int x = 0; x < width_; x += AREA)
+        parts.push_back({{y, x, std::min(AREA, height_ - y), std::min(AREA, width_ - x)}});
     return parts;
   }
 
@@ -397,14 +425,15 @@ class Repair {
     std::vector<Group> parts;
     for (const Run &y : along(height_))
       for (const Run &x : along(width_))
-        if (wanted(y.start, x.start)) parts.push_back({{y.start, x.start, y.size, x.size}, {}});
+        if (wanted(y.start, x.start)) parts.push_back({{y.start, x.start, y.size, x.size}});
     return parts;
   }
 
   // The kinds of pixels to decide in automatic mode: steps of kinds that are often wrong, and ramps if the map is soft.
   KindMask doubtful_kinds(bool is_soft) const {
     KindMask selected;
-    for (int kind = 0; kind < 2 * KINDS; kind++) selected[kind] = kind % KINDS / DIRECTIONS >= 2 * RINGS ? is_soft : wrong(kind) > DOUBTFUL;
+    for (int kind = 0; kind < 2 * KINDS; kind++)
+      selected[kind] = kind % KINDS / DIRECTIONS >= 2 * RINGS ? is_soft : wrong(kind) > DOUBTFUL;
     return selected;
   }
 
@@ -481,11 +510,13 @@ class Repair {
   }
 
   // Finds steps and ramps and their two surfaces: returns the groups' edges, and marks pixels up to `halo` around them.
-  std::vector<Group> find_in(std::vector<Group> groups, int halo, bool expects_ramps, bool measures, const KindMask &selected) {
+  std::vector<Group> find_in(std::vector<Group> groups, int halo, bool expects_ramps, bool measures,
+                             const KindMask &selected) {
     std::vector<EdgeSums> found(groups.size());
     parallel((int)groups.size(), [&](int g) {
       Group &group = groups[g];
-      find_in(group.part, in_frame(group.part.grown(halo)), expects_ramps, selected, measures ? &found[g] : nullptr, group.edges);
+      find_in(group.part, in_frame(group.part.grown(halo)), expects_ramps, selected, measures ? &found[g] : nullptr,
+              group.edges);
       group.bounds = bounds(group);
     });
     found_ = {};
@@ -499,7 +530,8 @@ class Repair {
   }
 
   // Finds the edges of one part.
-  void find_in(const Part &own, const Part &part, bool expects_ramps, const KindMask &selected, EdgeSums *found, std::vector<Edge> &edges) {
+  void find_in(const Part &own, const Part &part, bool expects_ramps, const KindMask &selected, EdgeSums *found,
+               std::vector<Edge> &edges) {
     for (int y = part.y0; y < part.bottom(); y++) {
       const size_t i = (size_t)y * width_ + part.x0;
       const float *values = map_.nearness + i;
@@ -508,7 +540,8 @@ class Repair {
     }
     const Part busy = changing(part);
     if (busy.height <= 0 || busy.width <= 0) return;
-    if (expects_ramps || !find_in(own, busy, STEP_HALO, selected, found, edges)) find_in(own, busy, HALO, selected, found, edges);
+    if (expects_ramps || !find_in(own, busy, STEP_HALO, selected, found, edges))
+      find_in(own, busy, HALO, selected, found, edges);
   }
 
   // Bounding box of the pixels where the map changes enough for an edge, grown by the halo.
@@ -518,7 +551,8 @@ class Repair {
     if (map_.steps) {
       least_step = NONE;
       for (int y = around.y0; y < around.bottom(); y++)
-        for (int x = around.x0; x < around.right(); x++) least_step = std::min(least_step, step((size_t)y * width_ + x));
+        for (int x = around.x0; x < around.right(); x++)
+          least_step = std::min(least_step, step((size_t)y * width_ + x));
     }
     const float change = 0.09f * least_step;
     Grid changes({0, 0, 2, around.width});
@@ -536,10 +570,10 @@ class Repair {
       vec row{};
       for (int x = 0; x < around.width; x += LANES) {
         const vec v = load<vec>(of_row + x);
-        row = most(v, row);
-        store(of_columns + x, most(v, load<vec>(of_columns + x)));
+        row = max(v, row);
+        store(of_columns + x, max(v, load<vec>(of_columns + x)));
       }
-      if (largest(row) > change) {
+      if (reduce_max(row) > change) {
         top = std::min(top, y);
         bottom = y + 1;
       }
@@ -554,130 +588,169 @@ class Repair {
     return {y0, x0, std::min(part.bottom(), wide.bottom()) - y0, std::min(part.right(), wide.right()) - x0};
   }
 
+  // The maps of a part whose edges are looked for.
+  struct Maps {
+    const bool is_wide;
+    const Part inner, beside, ramps;  // beside: pixels whose ramps affect the inner part; ramps: where a ramp may begin
+    const Grid raw, up, down, slope, jump, high, low, rows, ramp;
+    const Grid nears[RINGS], fars[RINGS], jumps[RINGS];  // near and far surface, and jump, within r + 1 pixels
+
+    Maps(const Part &inner, int halo) : Maps(inner, inner.grown(halo), inner.grown(RINGS), halo == HALO) {}
+
+   private:
+    Maps(const Part &inner, const Part &whole, const Part &beside, bool is_wide)
+        : is_wide(is_wide), inner(inner), beside(beside), ramps(is_wide ? beside.grown(RAMP_REACH) : beside),
+          raw(whole), up(whole), down(whole), slope(whole), jump(whole), high(whole), low(whole), rows(whole),
+          ramp(whole), nears{Grid(beside), Grid(beside), Grid(beside)}, fars{Grid(beside), Grid(beside), Grid(beside)},
+          jumps{Grid(beside), Grid(beside), Grid(beside)} {}
+  };
+
   // Finds the edges of the changing part; returns false if ramps require the larger halo.
   //
   // 1. Slopes that continue on both sides of a pixel are ramp candidates; end_ramps keeps the true ramps.
   // 2. Near and far surface within 1, 2 and 3 pixels, by maximum filters.
   // 3. A pixel belongs to the step at the smallest distance whose jump is abrupt.
   // 4. Each edge pixel gets its kind: ring or level on the ramp, side, and direction of the near surface.
-  bool find_in(const Part &own, const Part &inner, int halo, const KindMask &selected, EdgeSums *found, std::vector<Edge> &edges) {
-    const bool is_wide = halo == HALO;
-    const Part whole = inner.grown(halo), beside = inner.grown(RINGS), ramps = inner.grown(is_wide ? RINGS + RAMP_REACH : RINGS);
-    const Grid raw(whole), up(whole), down(whole), slope(whole), jump(whole), high(whole), low(whole), rows(whole), ramp(whole);
-    fetch(map_.nearness, raw, [this](float v) { return std::fabs(v) <= LARGEST ? sign_ * v : NAN; });
-    each_vector(whole, [&](int y, int x) {
-      const vec v = load<vec>(raw.at(y, x));
-      const auto is_valid = size_of(v) <= all(LARGEST);
-      store(up.at(y, x), is_valid ? v : all(-NONE));
-      store(down.at(y, x), is_valid ? -v : all(-NONE));
+  bool find_in(const Part &own, const Part &inner, int halo, const KindMask &selected, EdgeSums *found,
+               std::vector<Edge> &edges) {
+    const Maps m(inner, halo);
+    fetch(map_.nearness, m.raw, [this](float v) { return std::fabs(v) <= LARGEST ? sign_ * v : NAN; });
+    each_vector(m.raw, [&](int y, int x) {
+      const vec v = load<vec>(m.raw.at(y, x));
+      const auto is_valid = abs(v) <= LARGEST;
+      store(m.up.at(y, x), is_valid ? v : broadcast(-NONE));
+      store(m.down.at(y, x), is_valid ? -v : broadcast(-NONE));
     });
-    const auto step_at = [&](int y, int x) {
-      if (!map_.steps) return all(step(0));
-      vec steps;
-      const float *row = map_.steps + (size_t)std::min(std::max(y, 0), height_ - 1) * width_;
-      for (int i = 0; i < LANES; i++) steps[i] = row[std::min(std::max(x + i, 0), width_ - 1)];
-      return most(steps, all(noise_step_));
-    };
-    slopes(raw, slope, jump, is_wide ? ramps.grown(FLAT_REACH + 2) : beside);
-    ramp.clear();
-    // ramps within RINGS pixels affect the inner part
-    const auto any_beside = [&](const auto &is) {
-      vec any{};
-      each_vector(beside, [&](int y, int x) { any = is(y, x) ? all(1.0f) : any; });
-      return any_positive(any);
-    };
-    const auto is_steep = [&](int y, int x) { return load<vec>(slope.at(y, x)) > 0.1f * step_at(y, x); };
-    const auto is_ramp = [&](int y, int x) { return load<vec>(ramp.at(y, x)) > vec{}; };
-    if (any_beside(is_steep)) {
-      max_filter<REACH>(up, high, rows, ramps);
-      max_filter<REACH>(down, low, rows, ramps);
-      each_vector(ramps, [&](int y, int x) {
-        const vec span = load<vec>(high.at(y, x)) + load<vec>(low.at(y, x));
-        const auto is_candidate = is_steep(y, x) & (load<vec>(slope.at(y, x)) > SHALLOW * span) & (span > step_at(y, x)) & (size_of(load<vec>(raw.at(y, x))) <= all(LARGEST));
-        store(ramp.at(y, x), is_candidate ? all(1.0f) : vec{});
-      });
-    }
-    if (any_beside(is_ramp)) {
-      if (!is_wide) return false;
-      end_ramps(up, down, slope, high, low, rows, ramp, ramps);
-      each_vector(beside, [&](int y, int x) {
-        const vec near = load<vec>(high.at(y, x)), far = load<vec>(low.at(y, x));
-        const auto is_kept = is_ramp(y, x) & (near + far > step_at(y, x));
-        store(ramp.at(y, x), is_kept ? all(1.0f) : vec{});
-        store(up.at(y, x), is_kept ? near : load<vec>(up.at(y, x)));
-        store(down.at(y, x), is_kept ? far : load<vec>(down.at(y, x)));
-      });
-    }
-    // near and far surface within r + 1 pixels
-    const Grid nears[RINGS] = {Grid(beside), Grid(beside), Grid(beside)}, fars[RINGS] = {Grid(beside), Grid(beside), Grid(beside)},
-               jumps[RINGS] = {Grid(beside), Grid(beside), Grid(beside)};
-    for (int r = 0; r < RINGS; r++) {
-      const Part part = inner.grown(RINGS - 1 - r);
-      max_filter<1>(r ? nears[r - 1] : up, nears[r], rows, part);
-      max_filter<1>(r ? fars[r - 1] : down, fars[r], rows, part);
-      max_filter<1>(r ? jumps[r - 1] : jump, jumps[r], rows, part);
-    }
-    const Part means = inner.grown(2);  // over 5 x 5 pixels; their differences give the direction of the step
-    each_vector(inner.grown(4), [&](int y, int x) {
-      const vec v = load<vec>(raw.at(y, x));
-      store(slope.at(y, x), size_of(v) <= all(FINITE) ? v : vec{});
-    });
-    sums<2>(slope, high, rows, means, 1.0f / 25.0f);
-
+    slopes(m.raw, m.slope, m.jump, m.is_wide ? m.ramps.grown(FLAT_REACH + 2) : m.beside);
+    if (!find_ramps(m)) return false;
+    find_surfaces(m);
     float marks_of_row[AREA + LANES];
     for (int y = inner.y0; y < inner.bottom(); y++) {
-      const size_t row = (size_t)y * width_;
-      const bool is_own = y >= own.y0 && y < own.bottom();
-      for (int x = inner.x0, k = 0; x < inner.right(); x += LANES, k += LANES) {
-        const vec s = step_at(y, x), v = load<vec>(raw.at(y, x)), is_ramp = load<vec>(ramp.at(y, x)), none = {}, one = all(1.0f);
-        const auto is_valid = size_of(v) <= all(LARGEST);
-        vec near = load<vec>(nears[RINGS - 1].at(y, x)), far = load<vec>(fars[RINGS - 1].at(y, x)), unsure = {};
-        if (!any_of((near + far > s) | (is_ramp > none))) {  // no step is large enough
-          store(marks_of_row + k, is_valid ? none : all((float)UNSURE * (RINGS + 1)));
-          continue;
-        }
-        const vec least_gap = most(NEAREST * (near + far), s);
-        for (int r = RINGS - 1; r >= 0; r--) {
-          const vec n = load<vec>(nears[r].at(y, x)), f = load<vec>(fars[r].at(y, x)), gap = n + f;
-          const auto is_step = (gap > least_gap) & (load<vec>(jumps[r].at(y, x)) > ABRUPT * gap);
-          near = is_step ? n : near;
-          far = is_step ? f : far;
-          unsure = is_step ? all((float)(RINGS - r)) : unsure;
-        }
-        near = is_ramp > none ? load<vec>(up.at(y, x)) : near;
-        far = is_ramp > none ? -load<vec>(down.at(y, x)) : -far;
-        const auto is_edge = (is_ramp + unsure > none) & (near - far > s) & is_valid;
-        const vec is_near = 2.0f * v > near + far ? one : none;
-        const vec mark = (is_edge ? all((float)EDGE) : none) + is_near * (float)NEAR + is_ramp * (float)RAMP;
-        store(marks_of_row + k, (is_edge | (is_ramp > none) ? mark : none) + (float)UNSURE * (is_valid & (is_ramp <= none) ? unsure : all((float)(RINGS + 1))));
-        const int first = std::max(0, own.x0 - x), last = std::min(LANES, std::min(inner.right(), own.right()) - x);
-        int edges_here = is_own && first < last ? bits(is_edge) & ((1 << last) - (1 << first)) : 0;
-        if (!edges_here) continue;
-        const vec gap = most(near - far, all(1e-12f)), level = (v - far) / gap;
-        const vec right = load<vec>(high.at(y, x + 2)) - load<vec>(high.at(y, x - 2)), below = load<vec>(high.at(y + 2, x)) - load<vec>(high.at(y - 2, x));
-        const vec across = size_of(right) > size_of(below) + TIE * gap ? (right > none ? one : -one) : none;
-        const vec along = size_of(below) > size_of(right) + TIE * gap ? (below > none ? one : -one) : none;
-        const vec on_ramp = 2.0f * RINGS + convert(convert(least(most(level * (float)LEVELS, none), all(LEVELS - 1.0f))));
-        const vec place = is_ramp > none ? on_ramp : (level > 0.5f ? all((float)RINGS) : none) + (float)RINGS - unsure;
-        float nearest[LANES], farthest[LANES];
-        int32_t kinds[LANES], sides[LANES];
-        store(nearest, near);
-        store(farthest, far);
-        const ivec kind = convert(place * (float)DIRECTIONS + 2.0f * along + across + (float)(DIRECTIONS / 2));
-        store(kinds, kind);
-        store(sides, kind + convert(is_near * (float)KINDS));
-        for (; edges_here; edges_here &= edges_here - 1) {
-          const int n = __builtin_ctz(edges_here);
-          if (found) measure(*found, level[n], is_near[n] > 0, climb(raw.at(y, x + n), -1, 1, -raw.pitch, raw.pitch, gap[n]));
-          if (!selected[sides[n]]) continue;
-          edges.push_back({(int)row + x + n, nearest[n], farthest[n], (uint8_t)kinds[n]});
-          marks_of_row[k + n] += (float)LISTED;
-        }
-      }
-      uint8_t *marks = marks_.data() + row + inner.x0;
+      find_in_row(m, own, y, selected, found, edges, marks_of_row);
+      uint8_t *marks = marks_.data() + (size_t)y * width_ + inner.x0;
       for (int k = 0; k < inner.width; k++) marks[k] = (uint8_t)(int)marks_of_row[k];
     }
     return true;
+  }
+
+  // Smallest differences between two surfaces at LANES pixels.
+  vec steps_at(int y, int x) const {
+    if (!map_.steps) return broadcast(step(0));
+    vec steps = {};
+    const float *row = map_.steps + (size_t)std::clamp(y, 0, height_ - 1) * width_;
+    for (int i = 0; i < LANES; i++) steps[i] = row[std::clamp(x + i, 0, width_ - 1)];
+    return max(steps, broadcast(noise_step_));
+  }
+
+  // Marks ramps, and puts the surfaces at their ends into `up` and `down`; returns false if this takes the larger halo.
+  bool find_ramps(const Maps &m) const {
+    m.ramp.clear();
+    // ramps within RINGS pixels affect the inner part
+    const auto any_beside = [&](const auto &is) {
+      vec any{};
+      each_vector(m.beside, [&](int y, int x) { any = is(y, x) ? broadcast(1.0f) : any; });
+      return any_positive(any);
+    };
+    const auto is_steep = [&](int y, int x) { return load<vec>(m.slope.at(y, x)) > 0.1f * steps_at(y, x); };
+    const auto is_ramp = [&](int y, int x) { return load<vec>(m.ramp.at(y, x)) > vec{}; };
+    if (any_beside(is_steep)) {
+      max_filter<REACH>(m.up, m.high, m.rows, m.ramps);
+      max_filter<REACH>(m.down, m.low, m.rows, m.ramps);
+      each_vector(m.ramps, [&](int y, int x) {
+        const vec span = load<vec>(m.high.at(y, x)) + load<vec>(m.low.at(y, x));
+        const auto is_candidate = is_steep(y, x) & (load<vec>(m.slope.at(y, x)) > SHALLOW * span) &
+                                  (span > steps_at(y, x)) & (abs(load<vec>(m.raw.at(y, x))) <= LARGEST);
+        store(m.ramp.at(y, x), is_candidate ? broadcast(1.0f) : vec{});
+      });
+    }
+    if (!any_beside(is_ramp)) return true;
+    if (!m.is_wide) return false;
+    end_ramps(m.up, m.down, m.slope, m.high, m.low, m.rows, m.ramp, m.ramps);
+    each_vector(m.beside, [&](int y, int x) {
+      const vec near = load<vec>(m.high.at(y, x)), far = load<vec>(m.low.at(y, x));
+      const auto is_kept = is_ramp(y, x) & (near + far > steps_at(y, x));
+      store(m.ramp.at(y, x), is_kept ? broadcast(1.0f) : vec{});
+      store(m.up.at(y, x), is_kept ? near : load<vec>(m.up.at(y, x)));
+      store(m.down.at(y, x), is_kept ? far : load<vec>(m.down.at(y, x)));
+    });
+    return true;
+  }
+
+  // Near and far surface within each distance; `high`: means over 5 x 5 pixels, whose differences give the direction of
+  // the step.
+  void find_surfaces(const Maps &m) const {
+    for (int r = 0; r < RINGS; r++) {
+      const Part part = m.inner.grown(RINGS - 1 - r);
+      max_filter<1>(r ? m.nears[r - 1] : m.up, m.nears[r], m.rows, part);
+      max_filter<1>(r ? m.fars[r - 1] : m.down, m.fars[r], m.rows, part);
+      max_filter<1>(r ? m.jumps[r - 1] : m.jump, m.jumps[r], m.rows, part);
+    }
+    each_vector(m.inner.grown(4), [&](int y, int x) {
+      const vec v = load<vec>(m.raw.at(y, x));
+      store(m.slope.at(y, x), abs(v) <= FINITE ? v : vec{});
+    });
+    sums<2>(m.slope, m.high, m.rows, m.inner.grown(2), 1.0f / 25.0f);
+  }
+
+  // Finds the edges in a row: adds the selected ones to `edges`, measures those of the own part, and writes the marks
+  // of the row's pixels.
+  void find_in_row(const Maps &m, const Part &own, int y, const KindMask &selected, EdgeSums *found,
+                   std::vector<Edge> &edges, float *marks) const {
+    const bool is_own = y >= own.y0 && y < own.bottom();
+    const vec none = {}, one = broadcast(1.0f);
+    for (int x = m.inner.x0, k = 0; x < m.inner.right(); x += LANES, k += LANES) {
+      const vec s = steps_at(y, x), v = load<vec>(m.raw.at(y, x)), is_ramp = load<vec>(m.ramp.at(y, x));
+      const auto is_valid = abs(v) <= LARGEST;
+      vec near = load<vec>(m.nears[RINGS - 1].at(y, x)), far = load<vec>(m.fars[RINGS - 1].at(y, x)), unsure = {};
+      if (!any_of((near + far > s) | (is_ramp > none))) {  // no step is large enough
+        store(marks + k, is_valid ? none : broadcast((float)UNSURE * (RINGS + 1)));
+        continue;
+      }
+      const vec least_gap = max(NEAREST * (near + far), s);
+      for (int r = RINGS - 1; r >= 0; r--) {
+        const vec n = load<vec>(m.nears[r].at(y, x)), f = load<vec>(m.fars[r].at(y, x)), gap = n + f;
+        const auto is_step = (gap > least_gap) & (load<vec>(m.jumps[r].at(y, x)) > ABRUPT * gap);
+        near = is_step ? n : near;
+        far = is_step ? f : far;
+        unsure = is_step ? broadcast((float)(RINGS - r)) : unsure;
+      }
+      near = is_ramp > none ? load<vec>(m.up.at(y, x)) : near;
+      far = is_ramp > none ? -load<vec>(m.down.at(y, x)) : -far;
+      const auto is_edge = (is_ramp + unsure > none) & (near - far > s) & is_valid;
+      const vec is_near = 2.0f * v > near + far ? one : none;
+      const vec mark = (is_edge ? broadcast((float)EDGE) : none) + is_near * (float)NEAR + is_ramp * (float)RAMP;
+      const vec reference = is_valid & (is_ramp <= none) ? unsure : broadcast((float)(RINGS + 1));
+      store(marks + k, (is_edge | (is_ramp > none) ? mark : none) + (float)UNSURE * reference);
+      const int first = std::max(0, own.x0 - x), last = std::min(LANES, std::min(m.inner.right(), own.right()) - x);
+      int edges_here = is_own && first < last ? movemask(is_edge) & ((1 << last) - (1 << first)) : 0;
+      if (!edges_here) continue;
+      const vec gap = max(near - far, broadcast(1e-12f)), level = (v - far) / gap;
+      const ivec kind = kinds_at(m, y, x, gap, level, is_ramp, unsure), side = kind + convert(is_near * (float)KINDS);
+      for (; edges_here; edges_here &= edges_here - 1) {
+        const int n = __builtin_ctz(edges_here);
+        if (found) {
+          const float climbed = climb(m.raw.at(y, x + n), -1, 1, -m.raw.pitch, m.raw.pitch, gap[n]);
+          measure(*found, level[n], is_near[n] > 0, climbed);
+        }
+        if (!selected[side[n]]) continue;
+        edges.push_back({y * width_ + x + n, near[n], far[n], (uint8_t)kind[n]});
+        marks[k + n] += (float)LISTED;
+      }
+    }
+  }
+
+  // Kinds of LANES edge pixels. level: nearness, from 0 at the far surface to 1 at the near one; unsure: RINGS less the
+  // ring.
+  static ivec kinds_at(const Maps &m, int y, int x, vec gap, vec level, vec is_ramp, vec unsure) {
+    const vec none = {}, one = broadcast(1.0f);
+    const vec right = load<vec>(m.high.at(y, x + 2)) - load<vec>(m.high.at(y, x - 2));
+    const vec below = load<vec>(m.high.at(y + 2, x)) - load<vec>(m.high.at(y - 2, x));
+    const vec across = abs(right) > abs(below) + TIE * gap ? (right > none ? one : -one) : none;
+    const vec along = abs(below) > abs(right) + TIE * gap ? (below > none ? one : -one) : none;
+    const ivec of_level = convert(min(max(level * (float)LEVELS, none), broadcast(LEVELS - 1.0f)));
+    const vec on_step = (level > 0.5f ? broadcast((float)RINGS) : none) + (float)RINGS - unsure;
+    const vec place = is_ramp > none ? 2.0f * RINGS + convert(of_level) : on_step;
+    return convert(place * (float)DIRECTIONS + 2.0f * along + across + (float)(DIRECTIONS / 2));
   }
 
   // Adds an edge pixel to the statistics.
@@ -689,25 +762,26 @@ class Repair {
     found.lost += is_near - clamp01(level);
   }
 
-  // slope: the smaller change to both neighbours if these have one sign, else 0. jump: the larger change minus the slope.
+  // slope: the smaller change to both neighbours if these have one sign, else 0. jump: the larger change minus the
+  // slope.
   void slopes(const Grid &raw, const Grid &slope, const Grid &jump, const Part &part) const {
-    const auto known = [](vec change) { return size_of(change) <= all(FINITE) ? change : vec{}; };
+    const auto known = [](vec change) { return abs(change) <= FINITE ? change : vec{}; };
     each_vector(part, [&](int y, int x) {
       const float *at = raw.at(y, x);
       const vec here = load<vec>(at);
       const vec x0 = known(here - load<vec>(at - 1)), x1 = known(load<vec>(at + 1) - here);
       const vec y0 = known(here - load<vec>(at - raw.pitch)), y1 = known(load<vec>(at + raw.pitch) - here);
-      const vec ax0 = size_of(x0), ax1 = size_of(x1), ay0 = size_of(y0), ay1 = size_of(y1);
-      const vec sx = x0 * x1 > vec{} ? least(ax0, ax1) : vec{}, sy = y0 * y1 > vec{} ? least(ay0, ay1) : vec{};
-      store(slope.at(y, x), most(sx, sy));
-      store(jump.at(y, x), most(most(ax0, ax1) - sx, most(ay0, ay1) - sy));
+      const vec ax0 = abs(x0), ax1 = abs(x1), ay0 = abs(y0), ay1 = abs(y1);
+      const vec sx = x0 * x1 > vec{} ? min(ax0, ax1) : vec{}, sy = y0 * y1 > vec{} ? min(ay0, ay1) : vec{};
+      store(slope.at(y, x), max(sx, sy));
+      store(jump.at(y, x), max(max(ax0, ax1) - sx, max(ay0, ay1) - sy));
     });
   }
 
   // Nearness at both ends of each ramp: near in `high`, far in `low`, negated. Clears the ramp mark on slopes, which do
   // not flatten within FLAT_REACH pixels.
-  void end_ramps(const Grid &up, const Grid &down, const Grid &slope, const Grid &high, const Grid &low, const Grid &rows, const Grid &ramp,
-                 const Part &ramps) const {
+  void end_ramps(const Grid &up, const Grid &down, const Grid &slope, const Grid &high, const Grid &low,
+                 const Grid &rows, const Grid &ramp, const Part &ramps) const {
     const Part around = ramps.grown(FLAT_REACH), inside = in_frame(ramps);
     clamp_to_frame(slope, around.grown(2));
     sums<2>(slope, high, rows, around, -1.0f / 25.0f);
@@ -720,15 +794,18 @@ class Repair {
     std::vector<Piece> pieces;
     for (int y = inside.y0; y < inside.bottom(); y++)
       for (int x = ramps.x0; x < ramps.right(); x += LANES) {
-        vec is_ramp = (load<vec>(ramp.at(y, x)) > vec{}) & (-load<vec>(low.at(y, x)) < FLAT * load<vec>(slope.at(y, x))) ? all(1.0f) : vec{};
+        vec is_ramp = (load<vec>(ramp.at(y, x)) > vec{}) & (-load<vec>(low.at(y, x)) < FLAT * load<vec>(slope.at(y, x)))
+                          ? broadcast(1.0f)
+                          : vec{};
         if (x < inside.x0 || x + LANES > inside.right())
           for (int i = 0; i < LANES; i++)
             if (x + i < inside.x0 || x + i >= inside.right()) is_ramp[i] = 0;
         store(ramp.at(y, x), is_ramp);
-        if (largest(is_ramp) > 0) pieces.push_back(Piece{y, x, is_ramp, is_ramp});
+        if (reduce_max(is_ramp) > 0) pieces.push_back(Piece{y, x, is_ramp, is_ramp});
       }
     for (int y = ramps.y0; y < ramps.bottom(); y++) {
-      if (y < inside.y0 || y >= inside.bottom()) std::fill(ramp.at(y, ramps.x0), ramp.at(y, ramps.x0) + ramps.width, 0.0f);
+      if (y < inside.y0 || y >= inside.bottom())
+        std::fill(ramp.at(y, ramps.x0), ramp.at(y, ramps.x0) + ramps.width, 0.0f);
       for (int x = ramps.x0 - 1; x < ramps.right() + 1 + LANES; x += LANES) {
         store(high.at(y, x), load<vec>(up.at(y, x)));
         store(low.at(y, x), load<vec>(down.at(y, x)));
@@ -738,15 +815,15 @@ class Repair {
       memcpy(high.at(y, ramps.x0 - 1), up.at(y, ramps.x0 - 1), (ramps.width + 2) * sizeof(float));
       memcpy(low.at(y, ramps.x0 - 1), down.at(y, ramps.x0 - 1), (ramps.width + 2) * sizeof(float));
     }
-    vec changed = all(1.0f);
-    for (int round = 0; round < RAMP_REACH && largest(changed) > 0; round++) {
+    vec changed = broadcast(1.0f);
+    for (int round = 0; round < RAMP_REACH && reduce_max(changed) > 0; round++) {
       changed = vec{};
       for (Piece &b : pieces) {
         const vec near = load<vec>(high.at(b.y, b.x)), far = load<vec>(low.at(b.y, b.x));
         const auto is_ramp = load<vec>(ramp.at(b.y, b.x)) > vec{};
         b.near = is_ramp ? max_3x3(high.at(b.y, b.x), high.pitch) : near;
         b.far = is_ramp ? max_3x3(low.at(b.y, b.x), low.pitch) : far;
-        changed = (b.near > near) | (b.far > far) ? all(1.0f) : changed;
+        changed = (b.near > near) | (b.far > far) ? broadcast(1.0f) : changed;
       }
       for (const Piece &b : pieces) {
         store(high.at(b.y, b.x), b.near);
@@ -758,12 +835,14 @@ class Repair {
   // For each edge: the score of its surfaces by colour and, if wanted, their nearness.
   void judge(std::vector<Group> &groups, bool wants_surfaces) const {
     // a pixel is not its own reference
-    const std::vector<float> falloff = window([](float square) { return square > 0 ? std::exp(-square / (2 * FALLOFF_PX * FALLOFF_PX)) : 0.0f; });
+    const std::vector<float> falloff =
+        window([](float square) { return square > 0 ? std::exp(-square / (2 * FALLOFF_PX * FALLOFF_PX)) : 0.0f; });
     parallel((int)groups.size(), [&](int g) {
       if (groups[g].edges.empty()) return;
       groups[g].judged.resize(groups[g].edges.size());
       groups[g].around.resize((groups[g].edges.size() + LANES - 1) / LANES);
-      channels_ == 3 ? judge<3>(groups[g], falloff.data(), wants_surfaces) : judge<0>(groups[g], falloff.data(), wants_surfaces);
+      channels_ == 3 ? judge<3>(groups[g], falloff.data(), wants_surfaces)
+                     : judge<0>(groups[g], falloff.data(), wants_surfaces);
     });
   }
 
@@ -771,6 +850,46 @@ class Repair {
   static float more_blurred(const Edge &edge) {
     return clamp01((std::fabs(edge.near) - std::fabs(edge.far)) / MORE_BLURRED_PX);
   }
+
+  // A window around a pixel: weights of both surfaces, nearness, and squared differences to the pixel's colour.
+  struct Window {
+    vec weights[2][WINDOW], values[WINDOW], apart[WINDOW];
+  };
+  struct Windows {
+    explicit Windows(int count) : values(count * LANES) {}
+    Window of_pixel[LANES];
+    std::vector<float> values;  // of LANES pixels each: totals of both surfaces, and the pixels' own colours
+  };
+
+  // Likelihoods and surfaces of the pixels of some windows, and how alike the pixels around each one are.
+  struct Likelihoods {
+    float likely[2][LANES], surfaces[2][LANES], blurs[LANES];
+    Likelihoods(const Edge *edges, int pixels, const Windows &windows, vec per_spread, bool wants_surfaces,
+                float *around) {
+      for (int l = 0; l < pixels; l++) {
+        const Window &window = windows.of_pixel[l];
+        const float *apart_at = (const float *)window.apart + REACH * WHOLE + REACH;
+        for (int n = 0; n < 8; n++) around[n * LANES + l] = apart_at[NEIGHBOURS[n][0] * WHOLE + NEIGHBOURS[n][1]];
+        vec parts[6] = {};  // of both surfaces: likelihood, weights, weighted nearness
+        for (int n = 0; n < WINDOW; n++) {
+          const vec t = 1.0f + window.apart[n] * per_spread[l], alike = 1.0f / (t * t);
+          for (int side = 0; side < 2; side++) {
+            parts[side] += window.weights[side][n] * alike;
+            if (!wants_surfaces) continue;
+            const vec part = window.weights[side][n] * (alike + 1e-3f);
+            parts[2 + side] += part;
+            parts[4 + side] += part * window.values[n];
+          }
+        }
+        blurs[l] = more_blurred(edges[l]);
+        for (int side = 0; side < 2; side++) {
+          likely[side][l] = reduce_add(parts[side]);
+          surfaces[side][l] =
+              edges[l].near + reduce_add(parts[4 + side]) / std::max(reduce_add(parts[2 + side]), 1e-12f);
+        }
+      }
+    }
+  };
 
   // C: channels, or 0 for any number.
   //
@@ -788,33 +907,33 @@ class Repair {
     const int channels = C ? C : channels_, count = 4 + 2 * channels;
     const Part around = group.bounds.grown(REACH);
     const Grid given(around), witness(around), colour(around, channels);
-    for (int c = 0; c < channels; c++) fetch(map_.light + c * area_, colour, colour.at(around.y0, around.x0) + c * colour.size, root);
+    for (int c = 0; c < channels; c++)
+      fetch(map_.light + c * area_, colour, colour.at(around.y0, around.x0) + c * colour.size, root);
     fetch(map_.nearness, given, [this](float v) { return sign_ * valid(v); });
     fetch(marks_.data(), witness, [](uint8_t marks) { return (float)(marks / UNSURE); });
     float *sure = witness.at(around.y0, around.x0);
-    for (size_t i = 0; i < witness.size; i += LANES) store(sure + i, pick(SURE_OF, convert(load<vec>(sure + i))));
+    for (size_t i = 0; i < witness.size; i += LANES) store(sure + i, lookup(SURE_OF, convert(load<vec>(sure + i))));
     std::vector<vec> many(C ? 0 : count);
-    std::vector<float> of_lanes((count + channels) * LANES);  // of LANES pixels: totals, own colours
-    struct Window {
-      vec weights[2][WINDOW], values[WINDOW], apart[WINDOW];
-    } windows[LANES];
-    const vec none = {}, one = all(1.0f);
-    const auto of = [&](int n) { return load<vec>(&of_lanes[n * LANES]); };
+    Windows windows(count + channels);
+    const vec none = {};
     each_edge(group, [&](size_t k, const Edge &edge, int y, int x) {
       const int lane = (int)(k % LANES);
-      Window &window = windows[lane];
+      Window &window = windows.of_pixel[lane];
       const float near = edge.near, far = edge.far;
-      const vec most_difference = all(0.25f * std::max(near - far, 1e-12f));
+      const vec most_difference = broadcast(0.25f * std::max(near - far, 1e-12f));
       vec few[C ? 4 + 2 * C : 1];
       // of both surfaces: weights, squared colour differences, colour differences of each channel
       vec *sums = C ? few : many.data();
-      float *own = &of_lanes[count * LANES + lane];
+      float *own = &windows.values[count * LANES + lane];
       for (int n = 0; n < count; n++) sums[n] = none;
-      const float *given_at = given.at(y - REACH, x - REACH), *witness_at = witness.at(y - REACH, x - REACH), *colour_at = colour.at(y - REACH, x - REACH);
+      const float *given_at = given.at(y - REACH, x - REACH), *witness_at = witness.at(y - REACH, x - REACH),
+                  *colour_at = colour.at(y - REACH, x - REACH);
       for (int c = 0; c < channels; c++) own[c * LANES] = colour_at[c * colour.size + REACH * colour.pitch + REACH];
       each_of_window([&](int n, const auto &take) {
-        const vec value = take(given_at, given.pitch), weight = load<vec>(falloff + n * LANES) * take(witness_at, given.pitch), off = value - near;
-        const vec w[2] = {size_of(off) < most_difference ? weight : none, size_of(value - far) < most_difference ? weight : none};
+        const vec value = take(given_at, given.pitch),
+                  weight = load<vec>(falloff + n * LANES) * take(witness_at, given.pitch), off = value - near;
+        const vec w[2] = {abs(off) < most_difference ? weight : none,
+                          abs(value - far) < most_difference ? weight : none};
         vec apart = none;  // squared colour difference
         for (int c = 0; c < channels; c++) {
           const vec d = take(colour_at + c * colour.size, given.pitch) - own[c * LANES];
@@ -829,65 +948,54 @@ class Repair {
         window.values[n] = off;
         window.apart[n] = apart;
       });
-      for (int n = 0; n < count; n++) of_lanes[n * LANES + lane] = sum(sums[n]);
-      if (lane < LANES - 1 && k + 1 < group.edges.size()) return;
-
-      // LANES pixels at once
-      const vec per_total[2] = {1.0f / of(0), 1.0f / of(1)};
-      vec square = none, contrast = none, noise = none, from_mean[2] = {none, none}, along = none;
-      for (int c = 0; c < channels; c++) {
-        const vec mine = of(count + c), near_off = of(4 + 2 * c) * per_total[0], far_off = of(5 + 2 * c) * per_total[1], both = 2.0f * mine + near_off + far_off;
-        square += mine * mine;
-        from_mean[0] += near_off * near_off;
-        from_mean[1] += far_off * far_off;
-        contrast += (near_off - far_off) * (near_off - far_off);
-        along += far_off * (far_off - near_off);  // from the far surface's colour towards the near one's
-        noise += both * both;
-      }
-      vec spread = COLOUR_NOISE * noise + 1e-12f;
-      for (int side = 0; side < 2; side++) spread += 0.5f * most(of(2 + side) * per_total[side] - from_mean[side], none);
-      const vec per_light = 1.0f / (SIMILAR * square + 1e-12f), per_spread = 1.0f / (SPREAD * spread);
-      const auto is_known = (of(0) > 1e-3f) & (of(1) > 1e-3f);  // else the neighbours decide
-      const vec reliability = is_known ? most(contrast / (contrast + 0.5f * spread) - 0.1f, none) / 0.9f : one;
-      const vec share = most(least(along / most(contrast, all(1e-12f)), one), none);
-      const vec unmixed = 1.0f + most(from_mean[1] - share * (2.0f * along - share * contrast), none) / spread;
-      const vec mixed = wants_surfaces && map_.of_coc ? MIXTURE / (unmixed * unmixed) : none;
-      float likely[2][LANES], surfaces[2][LANES], blurs[LANES], *around = group.around[k / LANES].alike[0];
-      for (int l = 0; l <= lane; l++) {
-        const Window &window = windows[l];
-        const Edge &edge = group.edges[k - lane + l];
-        const float *apart_at = (const float *)window.apart + REACH * WHOLE + REACH;
-        for (int n = 0; n < 8; n++) around[n * LANES + l] = apart_at[NEIGHBOURS[n][0] * WHOLE + NEIGHBOURS[n][1]];
-        vec parts[6] = {};  // of both surfaces: likelihood, weights, weighted nearness
-        for (int n = 0; n < WINDOW; n++) {
-          const vec t = 1.0f + window.apart[n] * per_spread[l], alike = 1.0f / (t * t);
-          for (int side = 0; side < 2; side++) {
-            parts[side] += window.weights[side][n] * alike;
-            if (!wants_surfaces) continue;
-            const vec part = window.weights[side][n] * (alike + 1e-3f);
-            parts[2 + side] += part;
-            parts[4 + side] += part * window.values[n];
-          }
-        }
-        blurs[l] = more_blurred(edge);
-        for (int side = 0; side < 2; side++) {
-          likely[side][l] = sum(parts[side]);
-          surfaces[side][l] = edge.near + sum(parts[4 + side]) / std::max(sum(parts[2 + side]), 1e-12f);
-        }
-      }
-      for (int n = 0; n < 8; n++) store(around + n * LANES, 1.0f / (1.0f + load<vec>(around + n * LANES) * per_light));
-      vec likelihood[2];
-      for (int side = 0; side < 2; side++) likelihood[side] = load<vec>(likely[side]) * per_total[side] + 1e-9f;
-      likelihood[0] += mixed * load<vec>(blurs);
-      const vec likeliest = is_known ? least(most(likelihood[0], likelihood[1]) / LIKELY, one) : one;
-      const vec odds = likelihood[0] / likelihood[1], clear = least(least(of(0), of(1)) / (wants_surfaces ? CLEAR : CLEAR_IN_PRIOR), one);
-      for (int l = 0; l <= lane; l++) {
-        const Edge &edge = group.edges[k - lane + l];
-        score_[edge.i] = is_known[l] ? clamp(std::log(odds[l]), -8.0f, 8.0f) * (marks_[edge.i] & RAMP ? 1.0f : clear[l]) : 0.0f;
-        evidence_[edge.i] = likeliest[l];
-        group.judged[k - lane + l] = {0.0f, reliability[l], is_known[l] ? surfaces[0][l] : edge.near, is_known[l] ? surfaces[1][l] : edge.far};
-      }
+      for (int n = 0; n < count; n++) windows.values[n * LANES + lane] = reduce_add(sums[n]);
+      if (lane == LANES - 1 || k + 1 == group.edges.size())
+        score(group, k - lane, lane + 1, windows, channels, wants_surfaces);
     });
+  }
+
+  // Steps 2 to 5 of `judge` for up to LANES pixels at once, from pixel `first` of a group on.
+  void score(Group &group, size_t first, int pixels, const Windows &windows, int channels, bool wants_surfaces) const {
+    const vec none = {}, one = broadcast(1.0f);
+    const auto of = [&](int n) { return load<vec>(&windows.values[n * LANES]); };
+    const int count = 4 + 2 * channels;
+    const vec per_total[2] = {1.0f / of(0), 1.0f / of(1)};
+    vec square = none, contrast = none, noise = none, from_mean[2] = {none, none}, along = none;
+    for (int c = 0; c < channels; c++) {
+      const vec mine = of(count + c), near_off = of(4 + 2 * c) * per_total[0], far_off = of(5 + 2 * c) * per_total[1],
+                both = 2.0f * mine + near_off + far_off;
+      square += mine * mine;
+      from_mean[0] += near_off * near_off;
+      from_mean[1] += far_off * far_off;
+      contrast += (near_off - far_off) * (near_off - far_off);
+      along += far_off * (far_off - near_off);  // from the far surface's colour towards the near one's
+      noise += both * both;
+    }
+    vec spread = COLOUR_NOISE * noise + 1e-12f;
+    for (int side = 0; side < 2; side++) spread += 0.5f * max(of(2 + side) * per_total[side] - from_mean[side], none);
+    const vec per_light = 1.0f / (SIMILAR * square + 1e-12f), per_spread = 1.0f / (SPREAD * spread);
+    const auto is_known = (of(0) > 1e-3f) & (of(1) > 1e-3f);  // else the neighbours decide
+    const vec reliability = is_known ? max(contrast / (contrast + 0.5f * spread) - 0.1f, none) / 0.9f : one;
+    const vec share = max(min(along / max(contrast, broadcast(1e-12f)), one), none);
+    const vec unmixed = 1.0f + max(from_mean[1] - share * (2.0f * along - share * contrast), none) / spread;
+    const vec mixed = wants_surfaces && map_.is_coc ? MIXTURE / (unmixed * unmixed) : none;
+    float *const around = group.around[first / LANES].alike[0];
+    const Likelihoods found(&group.edges[first], pixels, windows, per_spread, wants_surfaces, around);
+    for (int n = 0; n < 8; n++) store(around + n * LANES, 1.0f / (1.0f + load<vec>(around + n * LANES) * per_light));
+    vec likelihood[2];
+    for (int side = 0; side < 2; side++) likelihood[side] = load<vec>(found.likely[side]) * per_total[side] + 1e-9f;
+    likelihood[0] += mixed * load<vec>(found.blurs);
+    const vec likeliest = is_known ? min(max(likelihood[0], likelihood[1]) / LIKELY, one) : one;
+    const vec odds = likelihood[0] / likelihood[1],
+              clear = min(min(of(0), of(1)) / (wants_surfaces ? CLEAR : CLEAR_IN_PRIOR), one);
+    for (int l = 0; l < pixels; l++) {
+      const Edge &edge = group.edges[first + l];
+      score_[edge.i] =
+          is_known[l] ? std::clamp(std::log(odds[l]), -8.0f, 8.0f) * (marks_[edge.i] & RAMP ? 1.0f : clear[l]) : 0.0f;
+      evidence_[edge.i] = likeliest[l];
+      group.judged[first + l] = {0.0f, reliability[l], is_known[l] ? found.surfaces[0][l] : edge.near,
+                                 is_known[l] ? found.surfaces[1][l] : edge.far};
+    }
   }
 
   // Averages the scores of neighbours of similar colour, and adds their evidence.
@@ -906,17 +1014,17 @@ class Repair {
         if (lane < LANES - 1 && k + 1 < group.edges.size()) return;
         const float *around = group.around[k / LANES].alike[0];
         const vec none = {};
-        vec total = all(1.0f), score = load<vec>(beside[8]), strongest = size_of(score);
+        vec total = broadcast(1.0f), score = load<vec>(beside[8]), strongest = abs(score);
         for (int n = 0; n < 8; n++) {
           const vec other = load<vec>(beside[n]), alike = other < NO_SCORE ? load<vec>(around + n * LANES) : none;
           total += alike;
           score += alike * other;
-          strongest = most(strongest, other < NO_SCORE ? size_of(other) : none);
+          strongest = max(strongest, other < NO_SCORE ? abs(other) : none);
         }
         score /= total;
         for (int l = 0; l <= lane; l++) {
           Judgement &judged = group.judged[k - lane + l];
-          judged.score = clamp(sharpness_ * judged.reliability * score[l], -6.0f, 6.0f);
+          judged.score = std::clamp(sharpness_ * judged.reliability * score[l], -6.0f, 6.0f);
           float &evidence = evidence_[group.edges[k - lane + l].i];
           evidence = std::max(clamp01(2.0f * judged.reliability * strongest[l] - 1.0f), evidence);
         }
@@ -943,14 +1051,19 @@ class Repair {
     for (const Group &group : groups)
       for (size_t k = 0; k < group.edges.size(); k++) {
         const Edge &edge = group.edges[k];
-        const float score = group.judged[k].score, level = (nearness(edge.i) - edge.far) / std::max(edge.near - edge.far, 1e-12f);
-        if (marks_[edge.i] & RAMP ? std::fabs(level - 0.5f) <= CLEAR_LEVEL : edge.kind / DIRECTIONS % RINGS != RINGS - 1) continue;
+        const float score = group.judged[k].score,
+                    level = (nearness(edge.i) - edge.far) / std::max(edge.near - edge.far, 1e-12f);
+        if (marks_[edge.i] & RAMP ? std::fabs(level - 0.5f) <= CLEAR_LEVEL
+                                  : edge.kind / DIRECTIONS % RINGS != RINGS - 1)
+          continue;
         const float weight = std::min(0.5f * std::fabs(score), 1.0f);
         const bool is_near = level > 0.5f;
         total[is_near] += weight;
         if ((score > 0) == is_near) agreed[is_near] += weight;
       }
-    const auto agrees = [&](bool side) { return (agreed[side] + 0.25f * PRIOR_COUNT) / (total[side] + 0.5f * PRIOR_COUNT) > RELATED; };
+    const auto agrees = [&](bool side) {
+      return (agreed[side] + 0.25f * PRIOR_COUNT) / (total[side] + 0.5f * PRIOR_COUNT) > RELATED;
+    };
     return agrees(false) || agrees(true);
   }
 
@@ -971,7 +1084,8 @@ class Repair {
         observed.odds.push_back(std::exp(-score));
       }
     for (Observations &observed : observations)
-      for (std::vector<float> *values : {&observed.weights, &observed.odds}) values->resize((values->size() + LANES - 1) / LANES * LANES);
+      for (std::vector<float> *values : {&observed.weights, &observed.odds})
+        values->resize((values->size() + LANES - 1) / LANES * LANES);
     const std::vector<float> together = fit(observations, DIRECTIONS, start, assumed);
     std::vector<float> each(KINDS);
     for (int k = 0; k < KINDS; k++) each[k] = together[k / DIRECTIONS];
@@ -983,7 +1097,8 @@ class Repair {
     std::vector<float> weights, odds;
   };
 
-  static std::vector<float> fit(const std::vector<Observations> &observations, int together, std::vector<float> share, const std::vector<float> &assumed) {
+  static std::vector<float> fit(const std::vector<Observations> &observations, int together, std::vector<float> share,
+                                const std::vector<float> &assumed) {
     const auto sum_of = [&](size_t first, const auto &part) {
       double totals[LANES] = {}, total = 0;
       for (size_t kind = first; kind < first + together; kind++)
@@ -999,8 +1114,9 @@ class Repair {
       const double total = sum_of(g * together, [](vec weight, vec) { return weight; });
       for (int round = 0; round < ROUNDS; round++) {
         const float odds = (1.0f - share[g]) / share[g];
-        const double found = sum_of(g * together, [&](vec weight, vec other) { return weight / (1.0f + odds * other); });
-        share[g] = clamp((float)((found + PRIOR_COUNT * assumed[g]) / (total + PRIOR_COUNT)), 0.005f, 0.995f);
+        const double found =
+            sum_of(g * together, [&](vec weight, vec other) { return weight / (1.0f + odds * other); });
+        share[g] = std::clamp((float)((found + PRIOR_COUNT * assumed[g]) / (total + PRIOR_COUNT)), 0.005f, 0.995f);
       }
     }
     return share;
@@ -1009,26 +1125,28 @@ class Repair {
   // Standard deviation, in pixels, of the blur that turned steps into ramps.
   float blur() const {
     const double width = CLIMBED * found_.middles / std::max(found_.climbed, 1e-12);
-    return clamp((float)std::sqrt(std::max(width * width - PIXEL, 0.0)), LEAST_BLUR_PX, MOST_BLUR_PX);
+    return std::clamp((float)std::sqrt(std::max(width * width - PIXEL, 0.0)), LEAST_BLUR_PX, MOST_BLUR_PX);
   }
 
-  // Decides which surface pixels show, and moves them to its nearness; on ramps in proportion to the evidence. Returns the
-  // width, in pixels, by which the map's near surfaces are too thin.
+  // Decides which surface pixels show, and moves them to its nearness; on ramps in proportion to the evidence. Returns
+  // the width, in pixels, by which the map's near surfaces are too thin.
   float move(const std::vector<Group> &groups, bool is_soft) const {
-    const float lean = map_.automatic ? LEAN : 0.0f, to_blurred = map_.automatic && map_.of_coc ? TO_BLURRED : 0.0f;
+    const float lean = map_.automatic ? LEAN : 0.0f, to_blurred = map_.automatic && map_.is_coc ? TO_BLURRED : 0.0f;
     float prior[KINDS];
     for (int k = 0; k < KINDS; k++) prior[k] = std::log(shares_[k] / (1.0f - shares_[k]));
     const auto odds = [&](const Group &group, size_t k) {
       const float score = group.judged[k].score;
       const Edge &edge = group.edges[k];
-      return score + prior[edge.kind] + lean * clamp01(std::fabs(score) - 1.0f) + (is_soft ? to_blurred * more_blurred(edge) : 0.0f);
+      return score + prior[edge.kind] + lean * clamp01(std::fabs(score) - 1.0f) +
+             (is_soft ? to_blurred * more_blurred(edge) : 0.0f);
     };
     std::vector<std::vector<float>> chances(groups.size());
     for (int round = 0; is_soft && round < DECIDED_ROUNDS; round++) {
       parallel((int)groups.size(), [&](int g) {
         chances[g].resize(groups[g].edges.size());
         for (size_t k = 0; k < chances[g].size(); k++)
-          chances[g][k] = 1.0f / (1.0f + std::exp(-odds(groups[g], k) - (round ? neighbours(groups[g].edges[k]) : 0.0f)));
+          chances[g][k] =
+              1.0f / (1.0f + std::exp(-odds(groups[g], k) - (round ? neighbours(groups[g].edges[k]) : 0.0f)));
       });
       parallel((int)groups.size(), [&](int g) {
         for (size_t k = 0; k < chances[g].size(); k++) score_[groups[g].edges[k].i] = chances[g][k];
@@ -1058,15 +1176,17 @@ class Repair {
   float neighbours(const Edge &edge) const {
     float odds = 0;
     for (const auto &[dy, dx] : NEIGHBOURS) {
-      const int at = std::clamp(edge.i / width_ + dy, 0, height_ - 1) * width_ + std::clamp(edge.i % width_ + dx, 0, width_ - 1);
+      const int at =
+          std::clamp(edge.i / width_ + dy, 0, height_ - 1) * width_ + std::clamp(edge.i % width_ + dx, 0, width_ - 1);
       const bool is_near = sign_ * valid(map_.nearness[at]) > 0.5f * (edge.near + edge.far);
-      odds += (dy * dx ? DIAGONAL : BESIDE) * (2.0f * (marks_[at] & LISTED ? score_[at] : (float)is_near) - 1.0f);
+      odds += (dy && dx ? DIAGONAL : BESIDE) * (2.0f * (marks_[at] & LISTED ? score_[at] : (float)is_near) - 1.0f);
     }
     return odds;
   }
 
   // Removes rims beside steps that are a little nearer, or farther, than the surface to which they belong: the ringing
-  // of interpolation. Such pixels move to the closer end of the range between the closed opening and the opened closing.
+  // of interpolation. Such pixels move to the closer end of the range between the closed opening and the opened
+  // closing.
   void remove_ringing() {
     memcpy(evidence_.data(), map_.out, area_ * sizeof(float));
     const std::vector<Group> parts = tiles();
@@ -1082,13 +1202,13 @@ class Repair {
       fetch(evidence_.data(), up, [this](float v) { return std::fabs(v) <= LARGEST ? sign_ * v : -NONE; });
       fetch(evidence_.data(), down, [this](float v) { return std::fabs(v) <= LARGEST ? -sign_ * v : -NONE; });
       for (const Grid *values : {&up, &down}) spread(*values, 3, true);
-      vec widest = all(-NONE);
+      vec widest = broadcast(-NONE);
       each_vector(part, [&](int y, int x) {
         const vec here = -load<vec>(up.at(y, x)) - load<vec>(down.at(y, x));
         store(span.at(y, x), here);
-        widest = most(widest, here);
+        widest = max(widest, here);
       });
-      if (!map_.steps && !(largest(widest) > step(0))) return;
+      if (!map_.steps && !(reduce_max(widest) > step(0))) return;
       for (const Grid *values : {&up, &down}) {  // the closed opening of -up and of up
         spread(*values, 2, false);
         spread(*values, 1, true);
@@ -1099,7 +1219,7 @@ class Repair {
           const size_t i = (size_t)y * width_ + x;
           const float own = sign_ * map_.out[i], gap = *span.at(y, x), ends[2] = {-*up.at(y, x), *down.at(y, x)};
           if (!(std::fabs(own) <= LARGEST && gap > step(i))) continue;
-          const float moved = clamp(own, std::min(ends[0], ends[1]), std::max(ends[0], ends[1])) - own;
+          const float moved = std::clamp(own, std::min(ends[0], ends[1]), std::max(ends[0], ends[1])) - own;
           map_.out[i] = sign_ * (own + moved * clamp01(2.0f - std::fabs(moved) / (OVERSHOOT * gap)));
         }
     });
@@ -1126,7 +1246,8 @@ class Repair {
     const int pitches[2] = {blurred.pitch, shape.pitch};
     vec of_y[2] = {}, of_covers[2][3] = {};  // weighted sums of y, y y; and of x, x x, x y for both shapes
     each_of_window([&](int n, const auto &take) {
-      const vec weight = load<vec>(weights + n * LANES), none = {}, cy = take(given_at, given.pitch) - own, wy = weight * cy;
+      const vec weight = load<vec>(weights + n * LANES), none = {}, cy = take(given_at, given.pitch) - own,
+                wy = weight * cy;
       of_y[0] += wy;
       of_y[1] += wy * cy;
       for (int i = 0; i < 2; i++) {
@@ -1136,34 +1257,37 @@ class Repair {
         of_covers[i][2] += wx * cy;
       }
     });
-    const float mean_y = sum(of_y[0]), yy = std::max(sum(of_y[1]) - mean_y * mean_y, 0.0f);
+    const float mean_y = reduce_add(of_y[0]), yy = std::max(reduce_add(of_y[1]) - mean_y * mean_y, 0.0f);
     float mean_x[2], of_x[2], both[2], explained[2];
     for (int i = 0; i < 2; i++) {
-      mean_x[i] = sum(of_covers[i][0]);
-      of_x[i] = std::max(sum(of_covers[i][1]) - mean_x[i] * mean_x[i], 0.0f);
-      both[i] = std::max(sum(of_covers[i][2]) - mean_x[i] * mean_y, 0.0f);
+      mean_x[i] = reduce_add(of_covers[i][0]);
+      of_x[i] = std::max(reduce_add(of_covers[i][1]) - mean_x[i] * mean_x[i], 0.0f);
+      both[i] = std::max(reduce_add(of_covers[i][2]) - mean_x[i] * mean_y, 0.0f);
       explained[i] = both[i] * both[i] / std::max(of_x[i] * yy, 1e-12f);
     }
-    const float b = both[0] / std::max(of_x[0], 1e-9f), better = clamp01((explained[0] - explained[1]) / std::max(BETTER * (1.0f - explained[1]), 1e-6f));
-    return {mean_y - b * mean_x[0] + own, b, of_x[0] > 0.004f ? clamp01((explained[0] - EXPLAINED) / EXPLAINED_MORE) * better : 0.0f};
+    const float b = both[0] / std::max(of_x[0], 1e-9f),
+                better = clamp01((explained[0] - explained[1]) / std::max(BETTER * (1.0f - explained[1]), 1e-6f));
+    return {mean_y - b * mean_x[0] + own, b,
+            of_x[0] > 0.004f ? clamp01((explained[0] - EXPLAINED) / EXPLAINED_MORE) * better : 0.0f};
   }
 
   // Raises the nearness of lamps of a few pixels, which a soft map averages with their surroundings.
   void lift_lamps(float sigma, float lost_px) const {
     const std::vector<float> weights = even_window();
-    const float is_lost = clamp01(2.4f + 2.5f * lost_px);  // 0 if the map's near surfaces are 1 px too wide: then it has lost no lamps
+    const float is_lost =
+        clamp01(2.4f + 2.5f * lost_px);  // 0 if the map's near surfaces are 1 px too wide: then it has lost no lamps
     const std::vector<Group> all_parts = tiles();
     const int reach = blur_reach(sigma);
     parallel((int)all_parts.size(), [&](int g) {
       const Part &inner = all_parts[g].part, part = in_frame(inner.grown(LAMP_REACH));
       const Grid near(part.grown(REACH));
       fetch(map_.nearness, near, [this](float v) { return sign_ * valid(v); });
-      vec high = all(-NONE), low = all(NONE);
+      vec high = broadcast(-NONE), low = broadcast(NONE);
       each_vector(near, [&](int y, int x) {
-        high = most(high, load<vec>(near.at(y, x)));
-        low = least(low, load<vec>(near.at(y, x)));
+        high = max(high, load<vec>(near.at(y, x)));
+        low = min(low, load<vec>(near.at(y, x)));
       });
-      if (!map_.steps && !(largest(high) - smallest(low) > 0.5f * step(0))) return;
+      if (!map_.steps && !(reduce_max(high) - reduce_min(low) > 0.5f * step(0))) return;
       const Group group{part, lamps_of(part, near)};
       if (group.edges.empty()) return;
       const Part around = bounds(group).grown(REACH), covered = around.grown(reach), whole = covered.grown(USUAL_REACH);
@@ -1172,7 +1296,8 @@ class Repair {
       max_filter<2>(bright, peak, rows, covered);
       each_vector(covered, [&](int y, int x) {
         const vec own = load<vec>(bright.at(y, x));
-        store(usual.at(y, x), own > 2.0f * load<vec>(usual.at(y, x)) ? own / most(load<vec>(peak.at(y, x)), all(1e-30f)) : vec{});
+        store(usual.at(y, x),
+              own > 2.0f * load<vec>(usual.at(y, x)) ? own / max(load<vec>(peak.at(y, x)), broadcast(1e-30f)) : vec{});
       });
       clamp_to_frame(usual, covered);
       gaussian(usual, blurred, rows, around, sigma);
@@ -1193,10 +1318,13 @@ class Repair {
         float sums[3] = {0, 0, 0};
         for (int v = y - LAMP_REACH; v <= y + LAMP_REACH; v++)
           for (int u = x - LAMP_REACH; u <= x + LAMP_REACH; u++)
-            for (int n = 0; n < 3; n++) sums[n] += lamps.at(std::min(std::max(v, 0), height_ - 1), std::min(std::max(u, 0), width_ - 1))[n * lamps.size];
+            for (int n = 0; n < 3; n++)
+              sums[n] +=
+                  lamps.at(std::min(std::max(v, 0), height_ - 1), std::min(std::max(u, 0), width_ - 1))[n * lamps.size];
         const float per_weight = 1.0f / std::max(sums[0], 1e-9f);
         const float repaired = sign_ * map_.out[lamp.i];
-        map_.out[lamp.i] = sign_ * (repaired + sums[2] * per_weight * is_lost * std::max(sums[1] * per_weight - repaired, 0.0f));
+        map_.out[lamp.i] =
+            sign_ * (repaired + sums[2] * per_weight * is_lost * std::max(sums[1] * per_weight - repaired, 0.0f));
       });
     });
   }
@@ -1217,7 +1345,8 @@ class Repair {
       for (int x = 0; x < bright.pitch; x++) roots[x] = std::sqrt(to[x]);
     }
     sums<USUAL_REACH>(light, usual, rows, part, 1.0f / ((2 * USUAL_REACH + 1) * (2 * USUAL_REACH + 1)));
-    each_vector(part, [&](int y, int x) { store(usual.at(y, x), load<vec>(usual.at(y, x)) * load<vec>(usual.at(y, x))); });
+    each_vector(part,
+                [&](int y, int x) { store(usual.at(y, x), load<vec>(usual.at(y, x)) * load<vec>(usual.at(y, x))); });
   }
 
   // The pixels of lamps in a part; up: nearness of the part and of REACH pixels around it.
@@ -1226,9 +1355,11 @@ class Repair {
     const Grid bright(whole), usual(part), rows(whole);
     brightest(bright, usual, rows, part);
     vec any{};
-    each_vector(part, [&](int y, int x) { any = most(any, load<vec>(bright.at(y, x)) > 4.0f * load<vec>(usual.at(y, x)) ? all(1.0f) : vec{}); });
+    each_vector(part, [&](int y, int x) {
+      any = max(any, load<vec>(bright.at(y, x)) > 4.0f * load<vec>(usual.at(y, x)) ? broadcast(1.0f) : vec{});
+    });
     std::vector<Edge> found;
-    if (!(largest(any) > 0)) return found;
+    if (!(reduce_max(any) > 0)) return found;
     const Part &around = up;
     const Grid down(around), high(part), low(part), peak(part);
     fetch(map_.nearness, down, [this](float v) { return -sign_ * valid(v); });
@@ -1239,7 +1370,8 @@ class Repair {
       for (int x = part.x0; x < part.right(); x++) {
         const size_t i = (size_t)y * width_ + x;
         const float own = *bright.at(y, x);
-        if (own > 4.0f * *usual.at(y, x) && own > 0.1f * *peak.at(y, x) && *high.at(y, x) + *low.at(y, x) > 0.5f * step(i) && std::fabs(map_.nearness[i]) <= LARGEST)
+        if (own > 4.0f * *usual.at(y, x) && own > 0.1f * *peak.at(y, x) &&
+            *high.at(y, x) + *low.at(y, x) > 0.5f * step(i) && std::fabs(map_.nearness[i]) <= LARGEST)
           found.push_back({(int)i, 0, 0, 0});
       }
     return found;
@@ -1252,7 +1384,8 @@ class Repair {
   void gaussian(const Grid &in, const Grid &out, const Grid &rows, const Part &part, float sigma) const {
     const int reach = blur_reach(sigma);
     float kernel[BLUR_REACH + 1], total = 0;
-    for (int d = -reach; d <= reach; d++) total += kernel[std::abs(d)] = std::exp(-(float)(d * d) / (2.0f * sigma * sigma));
+    for (int d = -reach; d <= reach; d++)
+      total += kernel[std::abs(d)] = std::exp(-(float)(d * d) / (2.0f * sigma * sigma));
     for (int d = 0; d <= reach; d++) kernel[d] /= total;
     each_vector({part.y0 - reach, part.x0, part.height + 2 * reach, part.width}, [&](int y, int x) {
       const float *from = in.at(y, x);
@@ -1264,7 +1397,8 @@ class Repair {
     each_vector(part, [&](int y, int x) {
       const float *from = rows.at(y, x);
       vec spread = kernel[0] * load<vec>(from);
-      for (int d = 1; d <= reach; d++) spread += kernel[d] * (load<vec>(from - d * rows.pitch) + load<vec>(from + d * rows.pitch));
+      for (int d = 1; d <= reach; d++)
+        spread += kernel[d] * (load<vec>(from - d * rows.pitch) + load<vec>(from + d * rows.pitch));
       store(out.at(y, x), spread);
     });
     clamp_to_frame(out, part);

@@ -1,10 +1,26 @@
 // Prepares a scene: cleaned copies, second surfaces, highlights.
-#include "engine.h"
-
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
 #include <limits>
+#include <memory>
+#include <utility>
+#include <vector>
 
+#include "api.h"
+#include "blocks.h"
+#include "blur_axis.h"
+#include "composite.h"
 #include "constants/checksum.h"
 #include "constants/exposure.h"
+#include "disocclusion.h"
+#include "entry.h"
+#include "extremes.h"
+#include "field_mask.h"
+#include "job.h"
+#include "layers.h"
+#include "simd.h"
+#include "threads.h"
 
 namespace torchdof {
 
@@ -16,7 +32,8 @@ Job::Job(const torchdof_scene &scene)
     l.scale = scene.scales[k];
     l.half = scene.halves[k];
     const int side = 2 * l.half + 1;
-    for (int e = 0; e < colours; e++, values += side * side) l.kernels.push_back(make_kernel(values, l.half, !scene.field_masks));
+    for (int e = 0; e < colours; e++, values += side * side)
+      l.kernels.push_back(make_kernel(values, l.half, !scene.field_masks));
     if (scene.field_masks && l.half) {
       l.field_mask = scene.field_masks + k;
       l.spots = ends_dark(*l.field_mask, scene.distances);
@@ -34,8 +51,8 @@ void ends_of(const float *values, int width, int rows, float *low, float *high) 
       float *const its_lows = &lows[i * LANES], *const its_highs = &highs[i * LANES];
       if ((i + 1) * BLOCK <= width)
         for (int x = 0; x < BLOCK; x += LANES) {
-          store(its_lows, least(load<vec>(of_block + x), load<vec>(its_lows)));
-          store(its_highs, most(load<vec>(of_block + x), load<vec>(its_highs)));
+          store(its_lows, min(load<vec>(of_block + x), load<vec>(its_lows)));
+          store(its_highs, max(load<vec>(of_block + x), load<vec>(its_highs)));
         }
       else
         for (int x = 0; x < width - i * BLOCK; x++) {
@@ -44,16 +61,12 @@ void ends_of(const float *values, int width, int rows, float *low, float *high) 
         }
     }
   for (int i = 0; i < blocks; i++) {
-    low[i] = smallest(load<vec>(&lows[i * LANES]));
-    high[i] = largest(load<vec>(&highs[i * LANES]));
+    low[i] = reduce_min(load<vec>(&lows[i * LANES]));
+    high[i] = reduce_max(load<vec>(&highs[i * LANES]));
   }
 }
 
 // Takes the inputs.
-//
-// 1. Replace values that are not finite by 0, in copies, and mark their pixels. Clamp coc to the range of the layers.
-// 2. Find the extremes of coc and light in each block and in the frame; refuse light whose powers would overflow.
-// 3. Copy the blocks with marked pixels, where these get the weight 0.
 void Job::take_scene() {
   surfaces.height = height;
   surfaces.width = width;
@@ -64,8 +77,6 @@ void Job::take_scene() {
   surfaces.blocks.resize((size_t)surfaces.block_rows * surfaces.block_columns);
   surfaces.light = scene.light[0];
   surfaces.coc = scene.coc[0];
-  const size_t area = surfaces.area();
-  const float low = coc_at(layers.front().node), high = coc_at(layers.back().node);
   if (scene.kind == TORCHDOF_STACK) {
     surfaces.count = scene.surfaces;
     surfaces.independent = true;
@@ -76,40 +87,53 @@ void Job::take_scene() {
     }
     return;
   }
-  block_low = Buffer<float>(surfaces.blocks.size());
-  block_high = Buffer<float>(surfaces.blocks.size());
+  clean_inputs();
+  find_extremes();
+  if (surfaces.valid) copy_masked_blocks();
+}
+
+// Replaces values that are not finite by 0, in copies, and marks their pixels. Clamps coc to the range of the layers.
+void Job::clean_inputs() {
+  const size_t area = surfaces.area();
+  const float low = coc_at(layers.front().node), high = coc_at(layers.back().node);
   float nearest, farthest, darkest = 0, brightest = 0;
   find_ends(surfaces.coc, area, scene.threads, &nearest, &farthest);
   if (scene.masked) find_ends(surfaces.light, area * channels, scene.threads, &darkest, &brightest);
-  const bool bad = scene.masked && !(std::isfinite(nearest) && std::isfinite(farthest) && std::isfinite(darkest) && std::isfinite(brightest));
-  if (bad || !(nearest >= low && farthest <= high)) {
-    clean_coc = Buffer<float>(area);
-    clean_light = Buffer<float>(bad ? area * channels : 0);
-    validity = Buffer<float>(bad ? area : 0);
-    parallel(height, [&](int y, int) {
-      for (size_t i = (size_t)y * width; i < (size_t)(y + 1) * width; i++) {
-        bool valid = true;
-        if (bad) {
-          valid = std::isfinite(surfaces.coc[i]);
-          for (int c = 0; c < channels; c++) valid &= std::isfinite(surfaces.light[c * area + i]);
-          for (int c = 0; c < channels; c++) clean_light[c * area + i] = valid ? surfaces.light[c * area + i] : 0.0f;
-          validity[i] = valid;
-        }
-        clean_coc[i] = valid ? clamp(surfaces.coc[i], low, high) : 0.0f;
+  const auto is_finite = [](float least, float most) { return std::isfinite(least) && std::isfinite(most); };
+  const bool bad = scene.masked && !(is_finite(nearest, farthest) && is_finite(darkest, brightest));
+  if (!bad && nearest >= low && farthest <= high) return;
+  clean_coc = Buffer<float>(area);
+  clean_light = Buffer<float>(bad ? area * channels : 0);
+  validity = Buffer<float>(bad ? area : 0);
+  parallel(height, [&](int y, int) {
+    for (size_t i = (size_t)y * width; i < (size_t)(y + 1) * width; i++) {
+      bool valid = true;
+      if (bad) {
+        valid = std::isfinite(surfaces.coc[i]);
+        for (int c = 0; c < channels; c++) valid &= std::isfinite(surfaces.light[c * area + i]);
+        for (int c = 0; c < channels; c++) clean_light[c * area + i] = valid ? surfaces.light[c * area + i] : 0.0f;
+        validity[i] = valid;
       }
-    });
-    surfaces.coc = clean_coc.data();
-    if (bad) surfaces.light = clean_light.data(), surfaces.valid = validity.data();
-  }
-  block_peak = Buffer<float>(surfaces.blocks.size());
+      clean_coc[i] = valid ? std::clamp(surfaces.coc[i], low, high) : 0.0f;
+    }
+  });
+  surfaces.coc = clean_coc.data();
+  if (bad) surfaces.light = clean_light.data(), surfaces.valid = validity.data();
+}
+
+// Finds the extremes of coc and light in each block and in the frame; refuses light whose powers would overflow.
+void Job::find_extremes() {
+  const size_t area = surfaces.area();
+  for (auto *extremes : {&block_low, &block_high, &block_peak}) *extremes = Buffer<float>(surfaces.blocks.size());
   std::vector<float> leasts((size_t)channels * surfaces.block_rows, INFINITY), mosts(leasts.size(), -INFINITY);
   parallel(surfaces.block_rows, [&](int by, int) {
-    const size_t first = (size_t)by * surfaces.block_columns;
-    ends_of(surfaces.coc + (size_t)by * BLOCK * width, width, std::min(BLOCK, height - by * BLOCK), &block_low[first], &block_high[first]);
+    const size_t first = (size_t)by * surfaces.block_columns, start = (size_t)by * BLOCK * width;
+    const int rows = std::min(BLOCK, height - by * BLOCK);
+    ends_of(surfaces.coc + start, width, rows, &block_low[first], &block_high[first]);
     float *const peaks = &block_peak[first];
     std::vector<float> lows(surfaces.block_columns), highs(surfaces.block_columns);
     for (int c = 0; c < channels; c++) {
-      ends_of(surfaces.light + c * area + (size_t)by * BLOCK * width, width, std::min(BLOCK, height - by * BLOCK), lows.data(), highs.data());
+      ends_of(surfaces.light + c * area + start, width, rows, lows.data(), highs.data());
       for (int i = 0; i < surfaces.block_columns; i++) peaks[i] = c ? std::max(peaks[i], highs[i]) : highs[i];
       leasts[by * channels + c] = *std::min_element(lows.begin(), lows.end());
       mosts[by * channels + c] = *std::max_element(highs.begin(), highs.end());
@@ -121,17 +145,21 @@ void Job::take_scene() {
     light_least[i % channels] = std::min(light_least[i % channels], leasts[i]);
     light_most[i % channels] = std::max(light_most[i % channels], mosts[i]);
   }
-  constexpr float BRIGHTEST = 1 << (std::numeric_limits<float>::max_exponent - constants::exposure::SUMMED) / 4;  // fourth powers are summed
+  // fourth powers are summed
+  constexpr float BRIGHTEST = 1 << (std::numeric_limits<float>::max_exponent - constants::exposure::SUMMED) / 4;
   for (int c = 0; c < channels; c++)
     if (std::max(light_most[c], -light_least[c]) > BRIGHTEST) throw TooBright();
-  if (surfaces.valid)
-    for (int i = 0; i < (int)surfaces.blocks.size(); i++) {
-      bool whole = true;
-      const int y0 = i / surfaces.block_columns * BLOCK, x0 = i % surfaces.block_columns * BLOCK;
-      for (int y = y0; y < std::min(height, y0 + BLOCK); y++)
-        for (int x = x0; x < std::min(width, x0 + BLOCK); x++) whole &= surfaces.valid[(size_t)y * width + x] > 0;
-      if (!whole) surfaces.make_block(i);
-    }
+}
+
+// Copies the blocks with marked pixels, where these get the weight 0.
+void Job::copy_masked_blocks() {
+  for (int i = 0; i < (int)surfaces.blocks.size(); i++) {
+    bool whole = true;
+    const int y0 = i / surfaces.block_columns * BLOCK, x0 = i % surfaces.block_columns * BLOCK;
+    for (int y = y0; y < std::min(height, y0 + BLOCK); y++)
+      for (int x = x0; x < std::min(width, x0 + BLOCK); x++) whole &= surfaces.valid[(size_t)y * width + x] > 0;
+    if (!whole) surfaces.make_block(i);
+  }
 }
 
 void find_ends(const float *values, int64_t count, int threads, float *low, float *high) {
@@ -141,16 +169,16 @@ void find_ends(const float *values, int64_t count, int threads, float *low, floa
   torchdof::parallel(threads, parts, nullptr, [&](int part, int) {
     const float *const its_values = values + part * PART;
     const int its_count = (int)std::min(PART, count - part * PART), whole = its_count / LANES * LANES;
-    vec its_lows = all(INFINITY), its_highs = all(-INFINITY), any_nan = {};
+    vec its_lows = broadcast(INFINITY), its_highs = broadcast(-INFINITY), any_nan = {};
     const auto look = [&](vec v) {
-      its_lows = least(v, its_lows);
-      its_highs = most(v, its_highs);
-      any_nan = v == v ? any_nan : all(1.0f);
+      its_lows = min(v, its_lows);
+      its_highs = max(v, its_highs);
+      any_nan = v == v ? any_nan : broadcast(1.0f);
     };
     for (int i = 0; i < whole; i += LANES) look(load<vec>(its_values + i));
-    for (int i = whole; i < its_count; i++) look(all(its_values[i]));
-    lows[part] = any_positive(any_nan) ? NAN : smallest(its_lows);
-    highs[part] = any_positive(any_nan) ? NAN : largest(its_highs);
+    for (int i = whole; i < its_count; i++) look(broadcast(its_values[i]));
+    lows[part] = any_positive(any_nan) ? NAN : reduce_min(its_lows);
+    highs[part] = any_positive(any_nan) ? NAN : reduce_max(its_highs);
   });
   *low = INFINITY;
   *high = -INFINITY;
@@ -216,8 +244,6 @@ int32_t torchdof_ends(const float *values, int64_t count, int32_t threads, float
   return torchdof::guarded([&] { torchdof::find_ends(values, count, threads, low, high); });
 }
 
-int64_t torchdof_interface(void) {
-  return (int64_t)torchdof::constants::native::REVISION << 32 | (int64_t)sizeof(torchdof_scene) << 16 | (int64_t)(sizeof(torchdof_map) + sizeof(torchdof_layers) + sizeof(torchdof_level));
-}
+int64_t torchdof_interface(void) { return torchdof::constants::checksum::INTERFACE; }
 
 int64_t torchdof_constants(void) { return torchdof::constants::checksum::ALL; }

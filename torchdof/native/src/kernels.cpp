@@ -1,13 +1,22 @@
 // Makes kernels of any radius from a lens's templates; formulas in optics/kernel_bank.py and optics/psf.py.
-#include "engine.h"
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstdlib>
+#include <memory>
+#include <vector>
+
+#include "api.h"
 #include "constants/psf.h"
+#include "entry.h"
+#include "threads.h"
 
 namespace torchdof {
 namespace {
 
 constexpr int MARGIN_PX = constants::psf::MARGIN_PX;
 constexpr double RIPPLING = constants::psf::RIPPLING;
-constexpr int FAR = 11;    // distance in pixels beyond which the spline is below 5e-7
+constexpr int FAR = 11;  // distance in pixels beyond which the spline is below 5e-7
 constexpr double ROOT = 1.7320508075688772, PI = 3.141592653589793;
 
 // The cardinal cubic spline: 1 at 0 and 0 at every other integer. Linear interpolation of PER_PX samples for each
@@ -55,7 +64,8 @@ struct Axis {
   Weights spline, line;
 
   Axis(int half, int count, double cell, bool folded)
-      : pixels(folded ? half + 1 : 2 * half + 1), cells(folded ? count + 1 : 2 * count + 1), spline(cells, pixels), line(cells, pixels) {
+      : pixels(folded ? half + 1 : 2 * half + 1), cells(folded ? count + 1 : 2 * count + 1), spline(cells, pixels),
+        line(cells, pixels) {
     const int p0 = folded ? 0 : -half, c0 = folded ? 0 : -count;
     static const Spline spline_at;
     const double wide = std::max(cell, 1.0);
@@ -84,7 +94,8 @@ struct Axis {
 };
 
 // Resamples the template: out [down.pixels, across.pixels]; row is a buffer.
-void product(const Axis &down, const Axis &across, const float *light, Axis::Weights Axis::*which, std::vector<float> &row, float *out) {
+void product(const Axis &down, const Axis &across, const float *light, Axis::Weights Axis::*which,
+             std::vector<float> &row, float *out) {
   const Axis::Weights &by_row = down.*which, &by_column = across.*which;
   std::fill(out, out + (size_t)down.pixels * across.pixels, 0.0f);
   for (int y = 0; y < down.pixels; y++) {
@@ -182,8 +193,8 @@ class Maker {
     for (int k = 0; k < side * side; k++) out[k] = (float)(out[k] * per_sum);
   }
 
-  // Removes the spline's overshoot from a kernel [n, n]: limits each value to twice the linear interpolation, and raises
-  // negative values to 0. Their four neighbours give the light for this, in proportion to their own.
+  // Removes the spline's overshoot from a kernel [n, n]: limits each value to twice the linear interpolation, and
+  // raises negative values to 0. Their four neighbours give the light for this, in proportion to their own.
   void settle(int n) {
     const int pitch = n + 2;
     positive_.assign((size_t)pitch * pitch, 0.0f);
@@ -215,7 +226,8 @@ class Maker {
     mirror(rate_);
     for (int y = 0; y < n; y++)
       for (int x = 0; x < n; x++)
-        settled_[(size_t)y * n + x] = std::max(positive_[(size_t)(y + 1) * pitch + x + 1] * (1 - around(rate_, y, x)), 0.0f);
+        settled_[(size_t)y * n + x] =
+            std::max(positive_[(size_t)(y + 1) * pitch + x + 1] * (1 - around(rate_, y, x)), 0.0f);
   }
 
   const torchdof_spots &s_;

@@ -1,5 +1,5 @@
-// The surfaces behind each pixel, read from the levels of a pyramid, forward and backward: the functions shown_behind and
-// search of render/surfaces/disocclusion.py, for training. Inference fills hidden surfaces in disocclusion.cpp.
+// The surfaces behind each pixel, read from the levels of a pyramid, forward and backward: the functions shown_behind
+// and search of render/surfaces/disocclusion.py, for training. Inference fills hidden surfaces in disocclusion.cpp.
 //
 // For a pixel with coc c, and the four samples j of level l around it with coc d, weight w and bilinear weight s:
 //
@@ -10,20 +10,30 @@
 //
 // The result is sum v_l m_l / sum v_l, and sum v_l.
 //
-// A cell of BEHIND_STEP x BEHIND_STEP pixels has the smallest coc of its pixels. Its first result is the farthest surface of
-// all levels: of two levels with different surfaces, only the farther one counts. Its second result is the one above, of
-// the coarse levels alone.
-#include "engine.h"
+// A cell of BEHIND_STEP x BEHIND_STEP pixels has the smallest coc of its pixels. Its first result is the farthest
+// surface of all levels: of two levels with different surfaces, only the farther one counts. Its second result is the
+// one above, of the coarse levels alone.
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <vector>
+
+#include "api.h"
+#include "blocks.h"
+#include "constants/native.h"
+#include "disocclusion.h"
+#include "entry.h"
 #include "rules.h"
+#include "threads.h"
 
 namespace torchdof {
 namespace {
 
-constexpr float LEAST_TOTAL = constants::disocclusion::LEAST_TOTAL;
+constexpr int MOST_PLANES = constants::native::MOST_PLANES;
 constexpr int BAND = 32;  // least rows of places whose gradients one thread adds up
 
-// Places of an axis, pixels or cells, `step` pixels apart and centred on an image; and the pixels of each place, as _window
-// of render/surfaces/disocclusion.py: on an axis of even size a cell's last pixel repeats the one before.
+// Places of an axis, pixels or cells, `step` pixels apart and centred on an image; and the pixels of each place, as
+// _window of render/surfaces/disocclusion.py: on an axis of even size a cell's last pixel repeats the one before.
 struct Axis {
   const int step, count, taps;
   std::vector<int> pixels;  // [count, taps]
@@ -53,16 +63,19 @@ template <int CHANNELS>
 struct Behind {
   static constexpr int MOST_VALUES = (CHANNELS ? CHANNELS : MOST_PLANES) + 2;
   const torchdof_level *const levels;
-  const float *const coc, *wanted;  // wanted: null if the places are pixels
+  const float *const coc, *wanted;          // wanted: null if the places are pixels
   const int count, channels, width, first;  // first: level of the mean
   const Axis down, across;
   std::vector<Between> rows, columns;
   const size_t area;
 
-  Behind(const torchdof_level *levels, int count, int channels, const float *coc, const float *wanted, int height, int width)
-      : levels(levels), coc(coc), wanted(wanted), count(count), channels(channels), width(width), first(wanted ? FINE_LEVELS : 0),
+  Behind(const torchdof_level *levels, int count, int channels, const float *coc, const float *wanted, int height,
+         int width)
+      : levels(levels), coc(coc), wanted(wanted), count(count), channels(channels), width(width),
+        first(wanted ? FINE_LEVELS : 0),
         down(height, wanted ? BEHIND_STEP : 1, wanted ? levels->rows * levels->step / BEHIND_STEP : height),
-        across(width, wanted ? BEHIND_STEP : 1, wanted ? levels->columns * levels->step / BEHIND_STEP : width), area((size_t)down.count * across.count) {
+        across(width, wanted ? BEHIND_STEP : 1, wanted ? levels->columns * levels->step / BEHIND_STEP : width),
+        area((size_t)down.count * across.count) {
     for (int l = 0; l < count; l++) {
       rows.emplace_back(down, levels[l].rows, levels[l].step);
       columns.emplace_back(across, levels[l].columns, levels[l].step);
@@ -75,7 +88,8 @@ struct Behind {
   template <typename Use>
   void each_pixel(int y, int x, const Use &use) const {
     for (int j = 0; j < across.taps; j++)
-      for (int i = 0; i < down.taps; i++) use((size_t)down.pixels[y * down.taps + i] * width + across.pixels[x * across.taps + j], j);
+      for (int i = 0; i < down.taps; i++)
+        use((size_t)down.pixels[y * down.taps + i] * width + across.pixels[x * across.taps + j], j);
   }
   // Smallest coc of a place; 0, with which no level is read, if none of its pixels is wanted.
   float nearest(int y, int x) const {
@@ -90,13 +104,13 @@ struct Behind {
 
   // Values of a place in a level.
   struct Found {
-    bool any;                       // false if nothing lies behind the place in this level, which then has no votes
-    size_t at[4];                   // of the samples
+    bool any;      // false if nothing lies behind the place in this level, which then has no votes
+    size_t at[4];  // of the samples
     float share[4], is_behind[4], part[4];  // is_behind: not clamped
-    float weight, looked;           // sum of the parts, or 0 if tiny; clamped blur
-    float mean[MOST_VALUES];        // light and coc
+    float weight, looked;                   // sum of the parts, or 0 if tiny; clamped blur
+    float mean[MOST_VALUES];                // light and coc
     float vote;
-    float of_mean[MOST_VALUES], of_vote, of_sure;  // gradients; of_sure: that of looked * weight / CERTAIN up to 1
+    float d_mean[MOST_VALUES], d_vote, d_sure;  // gradients; d_sure: that of looked * weight / CERTAIN up to 1
   };
   struct Result {
     float values[MOST_VALUES], votes;  // values: light and coc
@@ -166,10 +180,10 @@ struct Behind {
     for (int l = first; l < count; l++) {
       Found &f = found[l];
       if (!f.any) continue;
-      f.of_vote += slopes[(planes() - 1) * area] - along;
+      f.d_vote += slopes[(planes() - 1) * area] - along;
       for (int c = 0; c < planes() - 1; c++) {
-        f.of_vote += slope[c] * f.mean[c];
-        f.of_mean[c] += slope[c] * f.vote;
+        f.d_vote += slope[c] * f.mean[c];
+        f.d_mean[c] += slope[c] * f.vote;
       }
     }
   }
@@ -177,7 +191,7 @@ struct Behind {
   // How a level changes the farthest surface of the levels before it, whose votes are `votes`.
   struct Change {
     float apart, nearer, sure, vote, left, votes, part;  // left: share of the votes before that stays
-    Change(const Found &f, const Result &r, int of_coc) : apart(f.mean[of_coc] - r.values[of_coc]) {
+    Change(const Found &f, const Result &r, int coc_plane) : apart(f.mean[coc_plane] - r.values[coc_plane]) {
       nearer = r.votes > 0 ? is_another_surface(-apart) : 0.0f;
       sure = std::min(f.looked * f.weight / CERTAIN, 1.0f);
       vote = f.vote * (1.0f - nearer);
@@ -199,32 +213,32 @@ struct Behind {
     return r;
   }
   void back_of_farthest(const float *slopes, Found *found) const {
-    Result before[MOST_LEVELS], of;
+    Result before[MOST_LEVELS], d;
     farthest(found, before);
-    for (int c = 0; c < planes() - 1; c++) of.values[c] = slopes[c * area];
-    of.votes = slopes[(planes() - 1) * area];
+    for (int c = 0; c < planes() - 1; c++) d.values[c] = slopes[c * area];
+    d.votes = slopes[(planes() - 1) * area];
     const auto slopes_up = [](float distance) { return within(unlimited_another_surface(distance)); };
     for (int l = count - 1; l >= 0; l--) {
       Found &f = found[l];
       if (!f.any) continue;
       const Change change(f, before[l], planes() - 2);
-      float of_part = 0;
+      float d_part = 0;
       for (int c = 0; c < planes() - 1; c++) {
-        of_part += of.values[c] * (f.mean[c] - before[l].values[c]);
-        f.of_mean[c] += of.values[c] * change.part;
-        of.values[c] -= of.values[c] * change.part;
+        d_part += d.values[c] * (f.mean[c] - before[l].values[c]);
+        f.d_mean[c] += d.values[c] * change.part;
+        d.values[c] -= d.values[c] * change.part;
       }
-      of_part /= std::max(change.votes, LEAST_TOTAL);
-      if (change.votes >= LEAST_TOTAL) of.votes -= of_part * change.part;
-      const float of_vote = of.votes + of_part, of_left = of.votes * before[l].votes;
-      f.of_vote += of_vote * (1.0f - change.nearer);
-      f.of_sure -= of_left * is_another_surface(change.apart);
-      float of_apart = 0;
-      if (slopes_up(change.apart)) of_apart -= of_left * change.sure;
-      if (before[l].votes > 0 && slopes_up(-change.apart)) of_apart += of_vote * f.vote;
-      f.of_mean[planes() - 2] += of_apart;
-      of.values[planes() - 2] -= of_apart;
-      of.votes *= change.left;
+      d_part /= std::max(change.votes, LEAST_TOTAL);
+      if (change.votes >= LEAST_TOTAL) d.votes -= d_part * change.part;
+      const float d_vote = d.votes + d_part, d_left = d.votes * before[l].votes;
+      f.d_vote += d_vote * (1.0f - change.nearer);
+      f.d_sure -= d_left * is_another_surface(change.apart);
+      float d_apart = 0;
+      if (slopes_up(change.apart)) d_apart -= d_left * change.sure;
+      if (before[l].votes > 0 && slopes_up(-change.apart)) d_apart += d_vote * f.vote;
+      f.d_mean[planes() - 2] += d_apart;
+      d.values[planes() - 2] -= d_apart;
+      d.votes *= change.left;
     }
   }
 
@@ -247,18 +261,18 @@ struct Behind {
     });
   }
 
-  void gradient(const float *slopes, int threads, float *const *of_levels, float *of_coc) const {
+  void gradient(const float *slopes, int threads, float *const *d_levels, float *d_coc) const {
     // two bands with one between them read different samples: a place reads those up to 2.5 steps away
     const int band = std::max(BAND, 3 * levels[count - 1].step / down.step);
     for (int odd : {0, 1})
       torchdof::parallel(threads, ceil_div(down.count, 2 * band), nullptr, [&](int i, int) {
         for (int y = (2 * i + odd) * band; y < std::min((2 * i + odd + 1) * band, down.count); y++)
-          for (int x = 0; x < across.count; x++) place(y, x, slopes, of_levels, of_coc);
+          for (int x = 0; x < across.count; x++) place(y, x, slopes, d_levels, d_coc);
       });
   }
 
   // Adds a place's gradients to those of the samples and pixels that it reads.
-  void place(int y, int x, const float *slopes, float *const *of_levels, float *of_coc) const {
+  void place(int y, int x, const float *slopes, float *const *d_levels, float *d_coc) const {
     slopes += (size_t)y * across.count + x;
     bool used = false;  // places without a hidden surface have no gradient
     for (int c = 0; c < outputs(); c++) used |= slopes[c * area] != 0;
@@ -266,40 +280,41 @@ struct Behind {
     const float least = used ? nearest(y, x) : 0.0f;
     if (!find_all(y, x, least, found)) return;
     for (int l = 0; l < count; l++) {
-      found[l].of_vote = found[l].of_sure = 0;
-      std::fill(found[l].of_mean, found[l].of_mean + planes(), 0.0f);
+      found[l].d_vote = found[l].d_sure = 0;
+      std::fill(found[l].d_mean, found[l].d_mean + planes(), 0.0f);
     }
     if (wanted) back_of_farthest(slopes, found);
     if (first < count) back_of_mean(slopes + (wanted ? planes() * area : 0), found);
-    float of_least = 0;
+    float d_least = 0;
     for (int l = 0; l < count; l++) {
       const torchdof_level &level = levels[l];
       const Found &f = found[l];
       if (!f.any) continue;
       const size_t size = (size_t)level.rows * level.columns;
       const float counted = f.weight * level.slope, bounded = std::min(counted, level.most);
-      const float blur = unlimited_read(std::fabs(least), level.least_px), of_sure = f.looked * f.weight <= CERTAIN ? f.of_sure / CERTAIN : 0.0f;
-      if (blur <= 1) of_least += (f.of_vote * bounded + of_sure * f.weight) / level.least_px * (least < 0 ? -1.0f : 1.0f);
-      float of_parts = 0;
+      const float blur = unlimited_read(std::fabs(least), level.least_px),
+                  d_sure = f.looked * f.weight <= CERTAIN ? f.d_sure / CERTAIN : 0.0f;
+      if (blur <= 1) d_least += (f.d_vote * bounded + d_sure * f.weight) / level.least_px * (least < 0 ? -1.0f : 1.0f);
+      float d_parts = 0;
       if (f.weight > 0) {
-        of_parts = of_sure * f.looked;
-        if (counted <= level.most) of_parts += f.of_vote * f.looked * level.slope * (counted == level.most ? 0.5f : 1.0f);
+        d_parts = d_sure * f.looked;
+        if (counted <= level.most) d_parts += f.d_vote * f.looked * level.slope * (counted == level.most ? 0.5f : 1.0f);
       }
       const float per_weight = 1.0f / std::max(f.weight, LEAST_SEEN);
       for (int j = 0; j < 4; j++) {
         const float *value = level.values + f.at[j];
-        float *const of_value = of_levels[l] + f.at[j];
-        float of_part = of_parts;
+        float *const d_value = d_levels[l] + f.at[j];
+        float d_part = d_parts;
         for (int c = 0; c < planes() - 1; c++) {
-          const float of_mean = f.of_mean[c] * per_weight;
-          of_part += of_mean * (value[c * size] - f.mean[c]);
-          of_value[c * size] += of_mean * f.part[j];
+          const float d_mean = f.d_mean[c] * per_weight;
+          d_part += d_mean * (value[c * size] - f.mean[c]);
+          d_value[c * size] += d_mean * f.part[j];
         }
-        of_value[(planes() - 1) * size] += of_part * f.share[j] * clamp01(f.is_behind[j]);
+        d_value[(planes() - 1) * size] += d_part * f.share[j] * clamp01(f.is_behind[j]);
         if (!within(f.is_behind[j])) continue;
-        const float of_distance = of_part * f.share[j] * value[(planes() - 1) * size];
-        of_value[(planes() - 2) * size] += of_distance;
-        of_least -= of_distance * slope_of_end(least);
+        const float d_distance = d_part * f.share[j] * value[(planes() - 1) * size];
+        d_value[(planes() - 2) * size] += d_distance;
+        d_least -= d_distance * slope_of_end(least);
       }
     }
     // the gradient of equal coc is shared by columns, then by rows
@@ -307,7 +322,7 @@ struct Behind {
     each_pixel(y, x, [&](size_t at, int j) { ties[j] += coc[at] == least; });
     for (int n : ties) tied += n > 0;
     each_pixel(y, x, [&](size_t at, int j) {
-      if (coc[at] == least) of_coc[at] += of_least / (tied * ties[j]);
+      if (coc[at] == least) d_coc[at] += d_least / (tied * ties[j]);
     });
   }
 };
@@ -315,11 +330,13 @@ struct Behind {
 }  // namespace
 }  // namespace torchdof
 
-int32_t torchdof_look_behind(const torchdof_level *levels, int32_t count, int32_t channels, const float *coc, const float *wanted,
-                             int32_t height, int32_t width, int32_t threads, float *out, const float *gradient,
-                             float *const *of_levels, float *of_coc) {
+int32_t torchdof_look_behind(const torchdof_level *levels, int32_t count, int32_t channels, const float *coc,
+                             const float *wanted, int32_t height, int32_t width, int32_t threads, float *out,
+                             const float *gradient, float *const *d_levels, float *d_coc) {
   return torchdof::guarded([&] {
-    const auto run = [&](const auto &behind) { gradient ? behind.gradient(gradient, threads, of_levels, of_coc) : behind.look(threads, out); };
+    const auto run = [&](const auto &behind) {
+      gradient ? behind.gradient(gradient, threads, d_levels, d_coc) : behind.look(threads, out);
+    };
     if (channels == 3)
       run(torchdof::Behind<3>(levels, count, channels, coc, wanted, height, width));
     else

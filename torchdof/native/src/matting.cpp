@@ -1,14 +1,32 @@
 // Matting: a pixel at a depth edge mixes the light of two surfaces but has the depth of one. Splits it into both, as
-// described in render/surfaces/matting.py and render/surfaces/emitters.py.
-#include "constants/emitters.h"
+// described in render/surfaces/matting.py.
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <memory>
+#include <vector>
+
+#include "api.h"
+#include "blocks.h"
+#include "blur_axis.h"
 #include "constants/matting.h"
 #include "constants/pipeline.h"
-#include "engine.h"
+#include "emitters.h"
+#include "entry.h"
+#include "extremes.h"
+#include "highlights.h"
+#include "job.h"
+#include "light.h"
+#include "rules.h"
+#include "simd.h"
+#include "surfaces.h"
+#include "threads.h"
 
 namespace torchdof {
 namespace {
 
-// Constants of matting.py, emitters.py and pipeline.py in render, which give their meanings, units and effects.
+// Constants of matting.py and pipeline.py in render, which give their meanings, units and effects.
 constexpr float EDGE_PX = constants::matting::EDGE_PX;
 constexpr float UNCLEAN = constants::matting::UNCLEAN;
 constexpr float TRUST = constants::matting::TRUST;
@@ -16,23 +34,17 @@ constexpr float TEXTURE = constants::matting::TEXTURE;
 constexpr float MOST_CLEAN = constants::matting::MOST_CLEAN;
 constexpr float ALIKE = constants::matting::ALIKE;
 constexpr float UNBOUNDED = constants::matting::UNBOUNDED;
-constexpr float DIM = constants::emitters::DIM;
-constexpr float LEAST_PEAK = constants::emitters::LEAST_PEAK;
-constexpr float MOST_WEIGHT = constants::emitters::MOST_WEIGHT;
-constexpr int EMITTER_REACH = constants::emitters::EMITTER_REACH;
-constexpr int TOUCHING = constants::emitters::TOUCHING;
 constexpr float SAME_PX = constants::pipeline::SAME_PX;
-enum Side { IN_FRONT = -1, BEHIND = 1 };  // of an emitter, relative to a surface
 
 // Windows around the pixels of a block
-constexpr int REACH = 1;                   // pixels around a mixed pixel that define its two colours
+constexpr int REACH = 1;  // pixels around a mixed pixel that define its two colours
 constexpr int AROUND = 2 * REACH + 1;
 constexpr int TAPS = AROUND * AROUND;
-constexpr int RIM = REACH + 1;             // a neighbour's clean light depends on the pixels next to it
-constexpr int MARGIN = RIM + 1;            // edges depend on the pixels next to them
-constexpr int SIDE = BLOCK + 2 * MARGIN;   // of the window of coc
-constexpr int EDGES = BLOCK + 2 * RIM;     // of the windows of edges and light
-constexpr int PITCH = 24;                  // of all
+constexpr int RIM = REACH + 1;            // a neighbour's clean light depends on the pixels next to it
+constexpr int MARGIN = RIM + 1;           // edges depend on the pixels next to them
+constexpr int SIDE = BLOCK + 2 * MARGIN;  // of the window of coc
+constexpr int EDGES = BLOCK + 2 * RIM;    // of the windows of edges and light
+constexpr int PITCH = 24;                 // of all
 
 // Falloff of the Gaussian by which two surfaces mix, beside its centre.
 constexpr float SMALL_BESIDE = constants::matting::SOFTNESS_FALLOFF;
@@ -48,7 +60,8 @@ struct Frame {
 };
 
 struct Window {
-  explicit Window(int channels) : light((size_t)channels * EDGES * PITCH + LANES), clean(light), around((size_t)channels * (4 * TAPS + 9)) {}
+  explicit Window(int channels)
+      : light((size_t)channels * EDGES * PITCH + LANES), clean(light), around((size_t)channels * (4 * TAPS + 9)) {}
 
   float coc[SIDE * PITCH + LANES] = {}, valid[SIDE * PITCH + LANES] = {}, edge[EDGES * PITCH + LANES] = {};
   std::vector<float> light;  // [channels, EDGES, PITCH]
@@ -58,7 +71,9 @@ struct Window {
 
 // Gradients by the values of a window, by the range of the image's light, and by the surfaces of the window's block.
 struct Slopes {
-  explicit Slopes(int channels) : light((size_t)channels * EDGES * PITCH + LANES), clean(light), darkest(channels), brightest(channels), surfaces((size_t)(2 * channels + 2) * BLOCK * PITCH + LANES) {}
+  explicit Slopes(int channels)
+      : light((size_t)channels * EDGES * PITCH + LANES), clean(light), darkest(channels), brightest(channels),
+        surfaces((size_t)(2 * channels + 2) * BLOCK * PITCH + LANES) {}
 
   float coc[SIDE * PITCH + LANES] = {}, edge[EDGES * PITCH + LANES] = {};
   std::vector<float> light, clean;
@@ -78,8 +93,8 @@ void read_window(const Frame &frame, const float *plane, int y0, int x0, int siz
   }
 }
 
-// For each pixel outside the frame in a window of EDGES x EDGES pixels around a block: body(its place, that of the nearest
-// pixel inside).
+// For each pixel outside the frame in a window of EDGES x EDGES pixels around a block: body(its place, that of the
+// nearest pixel inside).
 template <typename Body>
 void each_outside(const Frame &frame, int y0, int x0, const Body &body) {
   if (y0 >= RIM && x0 >= RIM && y0 + BLOCK + RIM <= frame.height && x0 + BLOCK + RIM <= frame.width) return;
@@ -91,8 +106,8 @@ void each_outside(const Frame &frame, int y0, int x0, const Body &body) {
     }
 }
 
-// Computes for each pixel in and around a block the confidence, 0 to 1, that it lies at an edge. False if it is 0 in the
-// whole block.
+// Computes for each pixel in and around a block the confidence, 0 to 1, that it lies at an edge. False if it is 0 in
+// the whole block.
 bool find_edges(const Frame &frame, int y0, int x0, Window &w) {
   const float *valid = frame.valid;
   float lows[SIDE * PITCH], highs[SIDE * PITCH];  // of valid pixels
@@ -107,53 +122,54 @@ bool find_edges(const Frame &frame, int y0, int x0, Window &w) {
     float least_of[PITCH + LANES], most_of[PITCH + LANES];
     for (int j = 0; j < PITCH; j += LANES) {
       auto row = [&](const float *values, int k) { return load<vec>(values + (i + k) * PITCH + j); };
-      store(least_of + j, least(least(row(low, 0), row(low, 1)), row(low, 2)));
-      store(most_of + j, most(most(row(high, 0), row(high, 1)), row(high, 2)));
+      store(least_of + j, min(min(row(low, 0), row(low, 1)), row(low, 2)));
+      store(most_of + j, max(max(row(high, 0), row(high, 1)), row(high, 2)));
     }
     for (int j = 0; j < PITCH; j += LANES) {
       auto high_of = [&](int k) { return load<vec>(most_of + j + k); };
       auto low_of = [&](int k) { return load<vec>(least_of + j + k); };
-      const vec gap = most(most(high_of(0), high_of(1)), high_of(2)) - least(least(low_of(0), low_of(1)), low_of(2));
-      const vec edge = clamp01(gap * (1.0f / EDGE_PX) - all(1.0f));
+      const vec gap = max(max(high_of(0), high_of(1)), high_of(2)) - min(min(low_of(0), low_of(1)), low_of(2));
+      const vec edge = clamp01(gap * (1.0f / EDGE_PX) - 1.0f);
       store(w.edge + i * PITCH + j, valid ? edge * load<vec>(w.valid + (i + 1) * PITCH + j + 1) : edge);
     }
   }
   each_outside(frame, y0, x0, [&](int from, int to) { w.edge[from] = w.edge[to]; });
   vec most_edge = {};
   for (int i = RIM; i < RIM + BLOCK; i++)
-    for (int j = RIM; j < RIM + BLOCK; j += LANES) most_edge = most(most_edge, load<vec>(w.edge + i * PITCH + j));
+    for (int j = RIM; j < RIM + BLOCK; j += LANES) most_edge = max(most_edge, load<vec>(w.edge + i * PITCH + j));
   return any_positive(most_edge);
 }
 
 inline int tap(int i) { return i / AROUND * PITCH + i % AROUND; }
-inline vec only(ivec where, vec value) { return where ? value : vec{}; }
+inline vec select(ivec where, vec value) { return where ? value : vec{}; }
 inline void add(float *to, vec value) { store(to, load<vec>(to) + value); }
 // Where a value is not limited by clamp01, so that it has a gradient.
-inline ivec is_within(vec value) { return (value >= vec{}) & (value <= all(1.0f)); }
+inline ivec is_within(vec value) { return (value >= vec{}) & (value <= 1.0f); }
 
 // The nearest and farthest coc of the 3 x 3 pixels from a place of a window on.
 struct Ends {
-  vec near = all(NEVER), far = all(-NEVER);
+  vec near = broadcast(NEVER), far = broadcast(-NEVER);
 
   Ends(const Window &w, int at, bool masked) {
     for (int i = 0; i < TAPS; i++) {
       const vec coc = load<vec>(w.coc + at + tap(i));
       const ivec valid = masked ? load<vec>(w.valid + at + tap(i)) > vec{} : vec{} == vec{};
-      near = least(near, valid ? coc : all(NEVER));
-      far = most(far, valid ? coc : all(-NEVER));
+      near = min(near, valid ? coc : broadcast(NEVER));
+      far = max(far, valid ? coc : broadcast(-NEVER));
     }
   }
 
   // Shares the gradients by both among the pixels that have these coc.
-  void back(const Window &w, int at, bool masked, vec of_near, vec of_far, float *of_coc) const {
+  void back(const Window &w, int at, bool masked, vec d_near, vec d_far, float *d_coc) const {
     vec nearest = {}, farthest = {};
     for (int pass = 0; pass < 2; pass++)
       for (int i = 0; i < TAPS; i++) {
         const vec coc = load<vec>(w.coc + at + tap(i));
-        const vec counts = masked ? only(load<vec>(w.valid + at + tap(i)) > vec{}, all(1.0f)) : all(1.0f);
-        const vec is_near = only(coc == near, counts), is_far = only(coc == far, counts);
+        const vec counts = masked ? select(load<vec>(w.valid + at + tap(i)) > vec{}, broadcast(1.0f)) : broadcast(1.0f);
+        const vec is_near = select(coc == near, counts), is_far = select(coc == far, counts);
         if (pass)
-          add(of_coc + at + tap(i), of_near * is_near / most(nearest, all(1.0f)) + of_far * is_far / most(farthest, all(1.0f)));
+          add(d_coc + at + tap(i),
+              d_near * is_near / max(nearest, broadcast(1.0f)) + d_far * is_far / max(farthest, broadcast(1.0f)));
         else
           nearest += is_near, farthest += is_far;
       }
@@ -174,23 +190,26 @@ void clean_light(const Frame &frame, int y0, int x0, Window &w, const float *fal
     w.clean = w.light;
   for (int i = 1; i < EDGES - 1; i++)
     for (int j = 1; j < EDGES - 1; j += LANES) {
-      const int at = i * PITCH + j, first = at - PITCH - 1, middle = tap(TAPS / 2);  // the window of coc has one more pixel before
+      const int at = i * PITCH + j, first = at - PITCH - 1,
+                middle = tap(TAPS / 2);  // the window of coc has one more pixel before
       const vec edge = load<vec>(w.edge + at), coc = load<vec>(w.coc + at + middle);
       if (!any_of(edge > vec{})) {
-        for (int c = 0; slopes && c < frame.channels; c++) add(&slopes->light[c * plane + at], load<vec>(&slopes->clean[c * plane + at]));
+        for (int c = 0; slopes && c < frame.channels; c++)
+          add(&slopes->light[c * plane + at], load<vec>(&slopes->clean[c * plane + at]));
         continue;
       }
       vec near_by[TAPS], unmixed[TAPS], alike[TAPS], apart[TAPS], weight[TAPS], total = {};
       for (int k = 0; k < TAPS; k++) {
         apart[k] = (load<vec>(w.coc + at + tap(k)) - coc) * (1.0f / EDGE_PX);
-        near_by[k] = frame.valid ? falloff[k] * load<vec>(w.valid + at + tap(k)) : all(falloff[k]);
-        unmixed[k] = (all(1.0f + UNCLEAN) - load<vec>(w.edge + first + tap(k))) * near_by[k];
-        alike[k] = 2.0f - 2.0f * size_of(apart[k]);
+        near_by[k] = frame.valid ? falloff[k] * load<vec>(w.valid + at + tap(k)) : broadcast(falloff[k]);
+        unmixed[k] = (broadcast(1.0f + UNCLEAN) - load<vec>(w.edge + first + tap(k))) * near_by[k];
+        alike[k] = 2.0f - 2.0f * abs(apart[k]);
         weight[k] = unmixed[k] * clamp01(alike[k]);
         total += weight[k];
       }
-      const vec enough = total - 10.0f * UNCLEAN, is_clean = edge * clamp01(enough), per_total = 1.0f / most(total, all(1e-12f));
-      vec of_is_clean = {}, of_weight[TAPS] = {}, of_middle = {};
+      const vec enough = total - 10.0f * UNCLEAN, is_clean = edge * clamp01(enough),
+                per_total = 1.0f / max(total, broadcast(1e-12f));
+      vec d_is_clean = {}, d_weight[TAPS] = {}, d_middle = {};
       for (int c = 0; c < frame.channels; c++) {
         const float *const light = &w.light[c * plane];
         vec sum = {};
@@ -200,47 +219,54 @@ void clean_light(const Frame &frame, int y0, int x0, Window &w, const float *fal
           store(&w.clean[c * plane + at], here + is_clean * (mean - here));
           continue;
         }
-        const vec slope = load<vec>(&slopes->clean[c * plane + at]), of_mean = slope * is_clean * per_total;
-        of_is_clean += slope * (mean - here);
+        const vec slope = load<vec>(&slopes->clean[c * plane + at]), d_mean = slope * is_clean * per_total;
+        d_is_clean += slope * (mean - here);
         add(&slopes->light[c * plane + at], slope - slope * is_clean);
         for (int k = 0; k < TAPS; k++) {
-          of_weight[k] += of_mean * (load<vec>(light + first + tap(k)) - mean);
-          add(&slopes->light[c * plane + first + tap(k)], of_mean * weight[k]);
+          d_weight[k] += d_mean * (load<vec>(light + first + tap(k)) - mean);
+          add(&slopes->light[c * plane + first + tap(k)], d_mean * weight[k]);
         }
       }
       if (!slopes) continue;
-      add(slopes->edge + at, of_is_clean * clamp01(enough));
+      add(slopes->edge + at, d_is_clean * clamp01(enough));
       for (int k = 0; k < TAPS; k++) {
-        const vec slope = of_weight[k] + only(is_within(enough), of_is_clean * edge);
+        const vec slope = d_weight[k] + select(is_within(enough), d_is_clean * edge);
         add(slopes->edge + first + tap(k), -slope * clamp01(alike[k]) * near_by[k]);
-        const vec of_apart = only(is_within(alike[k]), slope * unmixed[k] * (-2.0f / EDGE_PX)) * (only(apart[k] > vec{}, all(1.0f)) - only(apart[k] < vec{}, all(1.0f)));
-        add(slopes->coc + at + tap(k), of_apart);
-        of_middle -= of_apart;
+        const vec d_apart = select(is_within(alike[k]), slope * unmixed[k] * (-2.0f / EDGE_PX)) *
+                            (select(apart[k] > vec{}, broadcast(1.0f)) - select(apart[k] < vec{}, broadcast(1.0f)));
+        add(slopes->coc + at + tap(k), d_apart);
+        d_middle -= d_apart;
       }
-      add(slopes->coc + at + middle, of_middle);
+      add(slopes->coc + at + middle, d_middle);
     }
-  for (int c = 0; !slopes && c < frame.channels; c++) each_outside(frame, y0, x0, [&](int from, int to) { w.clean[c * plane + from] = w.clean[c * plane + to]; });
+  for (int c = 0; !slopes && c < frame.channels; c++)
+    each_outside(frame, y0, x0, [&](int from, int to) { w.clean[c * plane + from] = w.clean[c * plane + to]; });
 }
 
 // Splits LANES pixels of a row.
 //
 // 1. The near and far coc are the extremes of the 3 x 3 neighbours.
-// 2. The colour of each surface is the mean of its neighbours. Their light moves towards their clean light, along the line
+// 2. The colour of each surface is the mean of its neighbours. Their light moves towards their clean light, along the
+// line
 //    between the clean colours of both surfaces, and less where texture is strong.
 // 3. The share of the near surface is the projection of the pixel's colour onto the line between both colours.
 // 4. The share of the other surface is at most 1/2. Where texture makes the projection unreliable, it is the share that
 //    the other surface has under a small Gaussian, unless this contradicts the pixel's colour. It may where the map as
 //    given has no edge; then the surfaces have their own colours.
-// 5. The residual colour goes to both surfaces in proportion to their shares, none of it to an other surface that is less
+// 5. The residual colour goes to both surfaces in proportion to their shares, none of it to an other surface that is
+// less
 //    blurred, within the range of the image's light.
 template <int CHANNELS>
 class Split {
  public:
   Split(const Frame &frame, Window &w, int y, int x, const float *falloff)
-      : frame_(frame), w_(w), falloff_(falloff), y_(y), x_(x), first_((y + 1) * PITCH + x + 1), in_coc_(first_ + PITCH + 1), masked_(frame.valid), ends_(w, in_coc_, masked_) {
+      : frame_(frame), w_(w), falloff_(falloff), y_(y), x_(x), first_((y + 1) * PITCH + x + 1),
+        in_coc_(first_ + PITCH + 1), masked_(frame.valid), ends_(w, in_coc_, masked_) {
     vec *memory = w.around.data();
-    for (vec **colours : {&light_, &clean_, &of_light_, &of_clean_}) *colours = memory, memory += C() * TAPS;
-    for (vec **colours : {&front_, &behind_, &colour_, &clean_front_, &clean_behind_, &of_front_, &of_behind_, &of_colour_, &of_contrast_}) *colours = memory, memory += C();
+    for (vec **colours : {&light_, &clean_, &d_light_, &d_clean_}) *colours = memory, memory += C() * TAPS;
+    for (vec **colours :
+         {&front_, &behind_, &colour_, &clean_front_, &clean_behind_, &d_front_, &d_behind_, &d_colour_, &d_contrast_})
+      *colours = memory, memory += C();
     find_colours();
     weigh();
   }
@@ -251,11 +277,11 @@ class Split {
       float *const to = plane + y_ * BLOCK + x_;
       store(to, beside ? value : load<vec>(to));
     };
-    const vec own = 1.0f - weight_, per_own = 1.0f / own, per_other = 1.0f / most(weight_, all(1e-12f));
+    const vec own = 1.0f - weight_, per_own = 1.0f / own, per_other = 1.0f / max(weight_, broadcast(1e-12f));
     for (int c = 0; c < C(); c++) {
       const vec others = Other(*this, c).light;
       put(block.own + c * BLOCK_PIXELS, (colour_[c] - others) * per_own * scale_);
-      put(block.other + c * BLOCK_PIXELS, only(weight_ > vec{}, others * per_other) * scale_);
+      put(block.other + c * BLOCK_PIXELS, select(weight_ > vec{}, others * per_other) * scale_);
     }
     const vec valid = valid_[TAPS / 2];
     put(block.coc, is_near_ ? ends_.far : ends_.near);
@@ -265,8 +291,8 @@ class Split {
 
   // Adds the gradients by the surfaces of these pixels to those by the window.
   void back(Slopes &slopes, ivec beside) {
-    std::fill(of_light_, of_light_ + 2 * C() * TAPS, vec{});
-    std::fill(of_front_, of_front_ + 4 * C(), vec{});
+    std::fill(d_light_, d_light_ + 2 * C() * TAPS, vec{});
+    std::fill(d_front_, d_front_ + 4 * C(), vec{});
     back_of_parts(slopes, beside);
     back_of_weight();
     back_of_colours(slopes);
@@ -275,22 +301,23 @@ class Split {
  private:
   // The light of the other surface, times its weight: in proportion to both weights, within the range of the image.
   struct Other {
-    vec own_mean, mean, unexplained, of_each, darkest, brightest, own_darkest, own_brightest, light;
+    vec own_mean, mean, unexplained, d_each, darkest, brightest, own_darkest, own_brightest, light;
     vec steps[4];  // the light after each limit but the last
 
     Other(const Split &s, int c) {
       const vec weight = s.weight_, own = 1.0f - weight;
       own_mean = s.is_near_ ? s.front_[c] : s.behind_[c], mean = s.is_near_ ? s.behind_[c] : s.front_[c];
       unexplained = s.colour_[c] - own * own_mean - weight * mean;
-      of_each = s.lent_ * weight / (weight * weight + own * own);
-      darkest = most(s.frame_.darkest[c] / s.scale_, all(-UNBOUNDED)), brightest = least(s.frame_.brightest[c] / s.scale_, all(UNBOUNDED));
+      d_each = s.lent_ * weight / (weight * weight + own * own);
+      darkest = max(s.frame_.darkest[c] / s.scale_, broadcast(-UNBOUNDED)),
+      brightest = min(s.frame_.brightest[c] / s.scale_, broadcast(UNBOUNDED));
       own_darkest = s.colour_[c] - own * darkest, own_brightest = s.colour_[c] - own * brightest;
       // the two parts still sum to the pixel, and neither is brighter or darker than the image
-      steps[0] = weight * (mean + unexplained * of_each);
-      steps[1] = most(steps[0], own_brightest);
-      steps[2] = least(steps[1], own_darkest);
-      steps[3] = most(steps[2], weight * darkest);
-      light = least(steps[3], weight * brightest);
+      steps[0] = weight * (mean + unexplained * d_each);
+      steps[1] = max(steps[0], own_brightest);
+      steps[2] = min(steps[1], own_darkest);
+      steps[3] = max(steps[2], weight * darkest);
+      light = min(steps[3], weight * brightest);
     }
   };
 
@@ -298,7 +325,8 @@ class Split {
   vec mean(const vec *light, const vec *weight, vec *mean) const {
     vec total = {}, variance = {};
     for (int i = 0; i < TAPS; i++) total += weight[i];
-    total = most(total, all(1e-12f));  // divided by, not multiplied with its inverse: equal values are exactly their mean
+    total = max(total,
+                broadcast(1e-12f));  // divided by, not multiplied with its inverse: equal values are exactly their mean
     for (int c = 0; c < C(); c++, light += TAPS) {
       vec one = {}, two = {};
       for (int i = 0; i < TAPS; i++) one += light[i] * weight[i];
@@ -310,55 +338,58 @@ class Split {
   }
 
   // Adds the gradients of `mean` by light and weights.
-  void back_of_mean(const vec *light, const vec *weight, const vec *mean, vec variance, const vec *of_mean, vec of_variance, vec *of_light, vec *of_weight) const {
+  void back_of_mean(const vec *light, const vec *weight, const vec *mean, vec variance, const vec *d_mean,
+                    vec d_variance, vec *d_light, vec *d_weight) const {
     vec total = {};
     for (int i = 0; i < TAPS; i++) total += weight[i];
-    const vec each = 1.0f / most(total, all(1e-12f));
+    const vec each = 1.0f / max(total, broadcast(1e-12f));
     for (int i = 0; i < TAPS; i++) {
-      vec sum = -of_variance * variance;
+      vec sum = -d_variance * variance;
       for (int c = 0; c < C(); c++) {
         const vec off = light[c * TAPS + i] - mean[c];
-        of_light[c * TAPS + i] += weight[i] * each * (of_mean[c] + 2.0f * of_variance * off);
-        sum += off * (of_mean[c] + of_variance * off);
+        d_light[c * TAPS + i] += weight[i] * each * (d_mean[c] + 2.0f * d_variance * off);
+        sum += off * (d_mean[c] + d_variance * off);
       }
-      of_weight[i] += sum * each;
+      d_weight[i] += sum * each;
     }
   }
 
   void find_colours() {
     const int plane = EDGES * PITCH;
-    for (int i = 0; i < TAPS; i++) valid_[i] = masked_ ? load<vec>(w_.valid + in_coc_ + tap(i)) : all(1.0f);
-    scale_ = all(TINY);  // brightest light around; all light is relative to it
+    for (int i = 0; i < TAPS; i++) valid_[i] = masked_ ? load<vec>(w_.valid + in_coc_ + tap(i)) : broadcast(1.0f);
+    scale_ = broadcast(TINY);  // brightest light around; all light is relative to it
     for (int c = 0; c < C(); c++)
       for (int i = 0; i < TAPS; i++) {
         light_[c * TAPS + i] = load<vec>(&w_.light[c * plane + first_ + tap(i)]);
-        scale_ = most(scale_, size_of(light_[c * TAPS + i]));
+        scale_ = max(scale_, abs(light_[c * TAPS + i]));
       }
     for (int i = 0; i < C() * TAPS; i++) light_[i] /= scale_;
     for (int c = 0; c < C(); c++) colour_[c] = light_[c * TAPS + TAPS / 2];
 
     here_ = load<vec>(w_.coc + in_coc_ + tap(TAPS / 2));
-    gap_ = most(ends_.far - ends_.near, all(1e-6f));
+    gap_ = max(ends_.far - ends_.near, broadcast(1e-6f));
     vec counted = {};  // sum of the weights of the small Gaussian
     covered_ = vec{};
     for (int i = 0; i < TAPS; i++) {
-      const vec weight = (all(1.0f + UNCLEAN) - load<vec>(w_.edge + first_ + tap(i))) * falloff_[i] * valid_[i];
-      const vec nearness = (ends_.far - load<vec>(w_.coc + in_coc_ + tap(i))) / gap_;  // not times 1 / gap, whose rounding the clamps below enlarge
+      const vec weight = (broadcast(1.0f + UNCLEAN) - load<vec>(w_.edge + first_ + tap(i))) * falloff_[i] * valid_[i];
+      const vec nearness = (ends_.far - load<vec>(w_.coc + in_coc_ + tap(i))) /
+                           gap_;  // not times 1 / gap, whose rounding the clamps below enlarge
       nearer_[i] = weight * clamp01(4.0f * nearness - 2.8f);
       farther_[i] = weight * clamp01(1.2f - 4.0f * nearness);
       small_[i] = (i == TAPS / 2 ? 1.0f : i % 2 ? SMALL_BESIDE : SMALL_DIAGONAL) * valid_[i];
       covered_ += small_[i] * nearness, counted += small_[i];
     }
-    per_counted_ = 1.0f / most(counted, all(1e-12f));
+    per_counted_ = 1.0f / max(counted, broadcast(1e-12f));
     covered_ *= per_counted_;
 
     const vec per_scale = 1.0f / scale_;
     for (int c = 0; c < C(); c++)
       for (int i = 0; i < TAPS; i++) {
         const vec relative = load<vec>(&w_.clean[c * plane + first_ + tap(i)]) * per_scale;
-        clean_[c * TAPS + i] = most(least(relative, all(MOST_CLEAN)), all(-MOST_CLEAN));
+        clean_[c * TAPS + i] = max(min(relative, broadcast(MOST_CLEAN)), broadcast(-MOST_CLEAN));
       }
-    clean_far_variance_ = mean(clean_, farther_, clean_behind_), clean_near_variance_ = mean(clean_, nearer_, clean_front_);
+    clean_far_variance_ = mean(clean_, farther_, clean_behind_),
+    clean_near_variance_ = mean(clean_, nearer_, clean_front_);
     vec strength = {};
     for (vec &shift : shift_) shift = vec{};
     for (int c = 0; c < C(); c++) {
@@ -388,174 +419,197 @@ class Split {
       along += (colour_[c] - behind_[c]) * contrast;
     }
     is_near_ = here_ - ends_.near < ends_.far - here_;
-    along_ = along / most(strength_, all(1e-12f)), fitted_ = clamp01(along_);
+    along_ = along / max(strength_, broadcast(1e-12f)), fitted_ = clamp01(along_);
     for (int c = 0; c < C(); c++) {
       const vec left = colour_[c] - behind_[c] - fitted_ * (front_[c] - behind_[c]);
       misfit_ += left * left;
     }
-    sharper_ = size_of(here_) - size_of(is_near_ ? ends_.far : ends_.near), lent_ = 1.0f - clamp01(sharper_);
+    sharper_ = abs(here_) - abs(is_near_ ? ends_.far : ends_.near), lent_ = 1.0f - clamp01(sharper_);
     noise_ = far_variance_ + near_variance_ + ALIKE * ALIKE;
     total_ = strength_ + TRUST * (far_variance_ + near_variance_ + misfit_) + ALIKE * ALIKE;
     trust_ = strength_ / total_;
     edge_ = load<vec>(w_.edge + first_ + tap(TAPS / 2));
-    sided_ = size_of((here_ - ends_.near) - (ends_.far - here_)) * (all(1.0f) / gap_);
-    clear_ = edge_ * clamp01(4.0f * sided_ - 2.0f), contradiction_ = misfit_ + (covered_ - fitted_) * (covered_ - fitted_) * strength_;
+    sided_ = abs((here_ - ends_.near) - (ends_.far - here_)) * (1.0f / gap_);
+    clear_ = edge_ * clamp01(4.0f * sided_ - 2.0f),
+    contradiction_ = misfit_ + (covered_ - fitted_) * (covered_ - fitted_) * strength_;
     by_fit_ = is_near_ ? 1.0f - fitted_ : fitted_, by_cover_ = is_near_ ? 1.0f - covered_ : covered_;
     wide_ = gap_ * (1.0f / EDGE_PX) - 2.0f;
-    geometric_ = least(by_cover_, all(0.5f)) * clear_ * (1.0f - trust_) * clamp01(wide_);
-    weight_ = least(by_fit_, all(0.5f)) * (clear_ * trust_) + geometric_ * noise_ / (noise_ + contradiction_);
+    geometric_ = min(by_cover_, broadcast(0.5f)) * clear_ * (1.0f - trust_) * clamp01(wide_);
+    weight_ = min(by_fit_, broadcast(0.5f)) * (clear_ * trust_) + geometric_ * noise_ / (noise_ + contradiction_);
   }
 
   // The gradients by the weight and the colours, from those by the surfaces.
   void back_of_parts(Slopes &slopes, ivec beside) {
-    const auto slope = [&](int plane) { return only(beside, load<vec>(&slopes.surfaces[plane * BLOCK * PITCH + y_ * PITCH + x_])); };
-    const vec own = 1.0f - weight_, known = most(weight_, all(1e-12f)), squares = weight_ * weight_ + own * own;
-    vec of_own = {}, of_lent = {};
-    of_weight_ = slope(2 * C() + 1);
-    const vec of_coc = slope(2 * C());
-    of_near_ = only(~is_near_, of_coc), of_far_ = only(is_near_, of_coc);
+    const auto slope = [&](int plane) {
+      return select(beside, load<vec>(&slopes.surfaces[plane * BLOCK * PITCH + y_ * PITCH + x_]));
+    };
+    const vec own = 1.0f - weight_, known = max(weight_, broadcast(1e-12f)), squares = weight_ * weight_ + own * own;
+    vec d_own = {}, d_lent = {};
+    d_weight_ = slope(2 * C() + 1);
+    const vec d_coc = slope(2 * C());
+    d_near_ = select(~is_near_, d_coc), d_far_ = select(is_near_, d_coc);
     for (int c = 0; c < C(); c++) {
       const Other other(*this, c);
       const vec own_light = (colour_[c] - other.light) / own, other_light = other.light / known;
-      const vec of_own_light = slope(c) * scale_, of_other_light = only(weight_ > vec{}, slope(C() + c) * scale_);
-      const vec of_part = of_own_light / own;
-      vec of_colour = of_part, of_mean = {};
-      of_own -= of_part * own_light;
+      const vec d_own_light = slope(c) * scale_, d_other_light = select(weight_ > vec{}, slope(C() + c) * scale_);
+      const vec d_part = d_own_light / own;
+      vec d_colour = d_part, d_mean = {};
+      d_own -= d_part * own_light;
       // by the other surface's light, and by its weight where the own part depends on their product
-      vec of_light = of_other_light - of_part * weight_;
-      of_weight_ -= of_part * other_light;
+      vec d_light = d_other_light - d_part * weight_;
+      d_weight_ -= d_part * other_light;
       // the gradient goes to the limit in force, or by halves to two equal ones
       const auto limited = [&](vec light, vec limit, bool upper) {
-        const vec by_limit = only(upper ? limit < light : limit > light, all(1.0f)) + only(limit == light, all(0.5f)), taken = of_light * by_limit;
-        of_light -= taken;
+        const vec by_limit = select(upper ? limit < light : limit > light, broadcast(1.0f)) +
+                             select(limit == light, broadcast(0.5f)),
+                  taken = d_light * by_limit;
+        d_light -= taken;
         return taken;
       };
-      vec of_brightest = limited(other.steps[3], weight_ * other.brightest, true), of_darkest = limited(other.steps[2], weight_ * other.darkest, false);
-      const vec by_darkest = limited(other.steps[1], other.own_darkest, true) / known, by_brightest = limited(other.steps[0], other.own_brightest, false) / known;
-      of_colour += by_darkest + by_brightest;
-      of_own -= by_darkest * other.darkest + by_brightest * other.brightest;
-      of_weight_ -= (by_darkest + by_brightest) * other_light;
-      of_darkest -= by_darkest * own, of_brightest -= by_brightest * own;
-      slopes.darkest[c] += sum(only(beside & (other.darkest > all(-UNBOUNDED)), of_darkest / scale_));
-      slopes.brightest[c] += sum(only(beside & (other.brightest < all(UNBOUNDED)), of_brightest / scale_));
-      // light = mean + unexplained of_each, of_each = lent weight / (weight^2 + own^2)
-      const vec of_each = of_light * other.unexplained * lent_, of_unexplained = of_light * other.of_each;
-      of_lent += of_light * other.unexplained * weight_ / squares;
-      of_colour += of_unexplained;
-      of_mean += of_light - of_unexplained * weight_;
-      of_own -= of_unexplained * other.own_mean + of_each * 2.0f * weight_ * own / (squares * squares);
-      of_weight_ += of_each * (own * own - weight_ * weight_) / (squares * squares) - of_unexplained * other.mean;
-      const vec of_own_mean = -of_unexplained * own;
-      of_front_[c] += is_near_ ? of_own_mean : of_mean;
-      of_behind_[c] += is_near_ ? of_mean : of_own_mean;
-      of_colour_[c] += of_colour;
+      vec d_brightest = limited(other.steps[3], weight_ * other.brightest, true),
+          d_darkest = limited(other.steps[2], weight_ * other.darkest, false);
+      const vec by_darkest = limited(other.steps[1], other.own_darkest, true) / known,
+                by_brightest = limited(other.steps[0], other.own_brightest, false) / known;
+      d_colour += by_darkest + by_brightest;
+      d_own -= by_darkest * other.darkest + by_brightest * other.brightest;
+      d_weight_ -= (by_darkest + by_brightest) * other_light;
+      d_darkest -= by_darkest * own, d_brightest -= by_brightest * own;
+      slopes.darkest[c] += reduce_add(select(beside & (other.darkest > -UNBOUNDED), d_darkest / scale_));
+      slopes.brightest[c] += reduce_add(select(beside & (other.brightest < UNBOUNDED), d_brightest / scale_));
+      // light = mean + unexplained d_each, d_each = lent weight / (weight^2 + own^2)
+      const vec d_each = d_light * other.unexplained * lent_, d_unexplained = d_light * other.d_each;
+      d_lent += d_light * other.unexplained * weight_ / squares;
+      d_colour += d_unexplained;
+      d_mean += d_light - d_unexplained * weight_;
+      d_own -= d_unexplained * other.own_mean + d_each * 2.0f * weight_ * own / (squares * squares);
+      d_weight_ += d_each * (own * own - weight_ * weight_) / (squares * squares) - d_unexplained * other.mean;
+      const vec d_own_mean = -d_unexplained * own;
+      d_front_[c] += is_near_ ? d_own_mean : d_mean;
+      d_behind_[c] += is_near_ ? d_mean : d_own_mean;
+      d_colour_[c] += d_colour;
     }
     // lent = 1 - sharper, sharper = |here| - |other coc|
-    const auto sign = [](vec value) { return only(value > vec{}, all(1.0f)) - only(value < vec{}, all(1.0f)); };
-    const vec of_sharper = only(is_within(sharper_), -of_lent), of_other = -of_sharper * sign(is_near_ ? ends_.far : ends_.near);
-    of_here_ = of_sharper * sign(here_);
-    of_near_ += only(~is_near_, of_other), of_far_ += only(is_near_, of_other);
-    of_weight_ -= of_own;
+    const auto sign = [](vec value) {
+      return select(value > vec{}, broadcast(1.0f)) - select(value < vec{}, broadcast(1.0f));
+    };
+    const vec d_sharper = select(is_within(sharper_), -d_lent),
+              d_other = -d_sharper * sign(is_near_ ? ends_.far : ends_.near);
+    d_here_ = d_sharper * sign(here_);
+    d_near_ += select(~is_near_, d_other), d_far_ += select(is_near_, d_other);
+    d_weight_ -= d_own;
   }
 
   // The gradients by the colours and by coverage, edge and coc, from those by the weight.
   void back_of_weight() {
-    const vec sum = noise_ + contradiction_, agreeing = noise_ / sum, of_geometric = of_weight_ * agreeing;
-    const vec of_agreeing = of_weight_ * geometric_ / sum, of_contradiction = -of_agreeing * agreeing;
-    const vec by_cover = least(by_cover_, all(0.5f)), by_fit = least(by_fit_, all(0.5f)), wide = clamp01(wide_), doubt = 1.0f - trust_;
-    const vec of_clear = of_geometric * by_cover * doubt * wide + of_weight_ * by_fit * trust_;
-    const vec of_trust = (of_weight_ * by_fit - of_geometric * by_cover * wide) * clear_;
-    const vec of_by_cover = only(by_cover_ <= all(0.5f), of_geometric * clear_ * doubt * wide), of_by_fit = only(by_fit_ <= all(0.5f), of_weight_ * clear_ * trust_);
-    const vec off = covered_ - fitted_, of_off = of_contradiction * 2.0f * off * strength_;
-    of_covered_ = of_off + (is_near_ ? -of_by_cover : of_by_cover);
-    vec of_fitted = (is_near_ ? -of_by_fit : of_by_fit) - of_off;
-    of_edge_ = of_clear * clamp01(4.0f * sided_ - 2.0f);
-    const vec signed_side = (here_ - ends_.near) - (ends_.far - here_), side = only(signed_side > vec{}, all(1.0f)) - only(signed_side < vec{}, all(1.0f));
-    const vec of_sided = only(is_within(4.0f * sided_ - 2.0f), of_clear * edge_ * 4.0f) / gap_;
-    of_here_ += 2.0f * side * of_sided;
-    of_near_ -= side * of_sided, of_far_ -= side * of_sided;
-    of_gap_ = only(is_within(wide_), of_geometric * by_cover * clear_ * doubt * (1.0f / EDGE_PX)) - of_sided * sided_;
-    const vec of_total = -of_trust * trust_ / total_, of_noisy = of_total * TRUST;
-    vec of_strength = of_trust / total_ + of_total + of_contradiction * off * off;
-    const vec of_misfit = of_contradiction + of_noisy;
-    of_variance_ = of_noisy + of_agreeing * (1.0f - agreeing);
+    const vec sum = noise_ + contradiction_, agreeing = noise_ / sum, d_geometric = d_weight_ * agreeing;
+    const vec d_agreeing = d_weight_ * geometric_ / sum, d_contradiction = -d_agreeing * agreeing;
+    const vec by_cover = min(by_cover_, broadcast(0.5f)), by_fit = min(by_fit_, broadcast(0.5f)), wide = clamp01(wide_),
+              doubt = 1.0f - trust_;
+    const vec d_clear = d_geometric * by_cover * doubt * wide + d_weight_ * by_fit * trust_;
+    const vec d_trust = (d_weight_ * by_fit - d_geometric * by_cover * wide) * clear_;
+    const vec d_by_cover = select(by_cover_ <= 0.5f, d_geometric * clear_ * doubt * wide),
+              d_by_fit = select(by_fit_ <= 0.5f, d_weight_ * clear_ * trust_);
+    const vec off = covered_ - fitted_, d_off = d_contradiction * 2.0f * off * strength_;
+    d_covered_ = d_off + (is_near_ ? -d_by_cover : d_by_cover);
+    vec d_fitted = (is_near_ ? -d_by_fit : d_by_fit) - d_off;
+    d_edge_ = d_clear * clamp01(4.0f * sided_ - 2.0f);
+    const vec signed_side = (here_ - ends_.near) - (ends_.far - here_),
+              side = select(signed_side > vec{}, broadcast(1.0f)) - select(signed_side < vec{}, broadcast(1.0f));
+    const vec d_sided = select(is_within(4.0f * sided_ - 2.0f), d_clear * edge_ * 4.0f) / gap_;
+    d_here_ += 2.0f * side * d_sided;
+    d_near_ -= side * d_sided, d_far_ -= side * d_sided;
+    d_gap_ = select(is_within(wide_), d_geometric * by_cover * clear_ * doubt * (1.0f / EDGE_PX)) - d_sided * sided_;
+    const vec d_total = -d_trust * trust_ / total_, d_noisy = d_total * TRUST;
+    vec d_strength = d_trust / total_ + d_total + d_contradiction * off * off;
+    const vec d_misfit = d_contradiction + d_noisy;
+    d_variance_ = d_noisy + d_agreeing * (1.0f - agreeing);
     for (int c = 0; c < C(); c++) {
-      const vec contrast = front_[c] - behind_[c], of_left = 2.0f * of_misfit * (colour_[c] - behind_[c] - fitted_ * contrast);
-      of_colour_[c] += of_left;
-      of_behind_[c] -= of_left;
-      of_fitted -= of_left * contrast;
+      const vec contrast = front_[c] - behind_[c],
+                d_left = 2.0f * d_misfit * (colour_[c] - behind_[c] - fitted_ * contrast);
+      d_colour_[c] += d_left;
+      d_behind_[c] -= d_left;
+      d_fitted -= d_left * contrast;
     }
-    const vec of_along = only(is_within(along_), of_fitted) / most(strength_, all(1e-12f));
-    of_strength -= only(strength_ >= all(1e-12f), of_along * along_);
-    const vec of_misfit_contrast = 2.0f * of_misfit * fitted_;
+    const vec d_along = select(is_within(along_), d_fitted) / max(strength_, broadcast(1e-12f));
+    d_strength -= select(strength_ >= broadcast(1e-12f), d_along * along_);
+    const vec d_misfit_contrast = 2.0f * d_misfit * fitted_;
     for (int c = 0; c < C(); c++) {
       const vec contrast = front_[c] - behind_[c], left = colour_[c] - behind_[c];
-      const vec of_contrast = of_along * left + 2.0f * of_strength * contrast - of_misfit_contrast * (left - fitted_ * contrast);
-      of_colour_[c] += of_along * contrast;
-      of_front_[c] += of_contrast;
-      of_behind_[c] -= of_along * contrast + of_contrast;
+      const vec d_contrast =
+          d_along * left + 2.0f * d_strength * contrast - d_misfit_contrast * (left - fitted_ * contrast);
+      d_colour_[c] += d_along * contrast;
+      d_front_[c] += d_contrast;
+      d_behind_[c] -= d_along * contrast + d_contrast;
     }
   }
 
   // The gradients by light, clean light, edges and coc of the window, from those by the colours.
   void back_of_colours(Slopes &slopes) {
-    vec of_nearer[TAPS] = {}, of_farther[TAPS] = {};
-    back_of_mean(light_, nearer_, front_, near_variance_, of_front_, of_variance_, of_light_, of_nearer);
-    back_of_mean(light_, farther_, behind_, far_variance_, of_behind_, of_variance_, of_light_, of_farther);
+    vec d_nearer[TAPS] = {}, d_farther[TAPS] = {};
+    back_of_mean(light_, nearer_, front_, near_variance_, d_front_, d_variance_, d_light_, d_nearer);
+    back_of_mean(light_, farther_, behind_, far_variance_, d_behind_, d_variance_, d_light_, d_farther);
 
     // light -= shift contrast, shift = per_strength sum((light - clean) contrast), of the clean colours
-    vec of_per_strength = {};
-    std::fill(of_contrast_, of_contrast_ + C(), vec{});
+    vec d_per_strength = {};
+    std::fill(d_contrast_, d_contrast_ + C(), vec{});
     for (int i = 0; i < TAPS; i++) {
       const vec shift = limited_shift(i);
-      vec of_shift = {}, along = {};
+      vec d_shift = {}, along = {};
       for (int c = 0; c < C(); c++) {
-        const vec contrast = clean_front_[c] - clean_behind_[c], off = light_[c * TAPS + i] + shift * contrast - clean_[c * TAPS + i];
-        of_shift -= of_light_[c * TAPS + i] * contrast;
-        of_contrast_[c] -= of_light_[c * TAPS + i] * shift;
+        const vec contrast = clean_front_[c] - clean_behind_[c],
+                  off = light_[c * TAPS + i] + shift * contrast - clean_[c * TAPS + i];
+        d_shift -= d_light_[c * TAPS + i] * contrast;
+        d_contrast_[c] -= d_light_[c * TAPS + i] * shift;
         along += off * contrast;
       }
-      of_shift = only(is_within(nearer_[i] > farther_[i] ? -shift_[i] : shift_[i]), of_shift);
-      of_per_strength += of_shift * along;
-      of_shift *= per_strength_;
+      d_shift = select(is_within(nearer_[i] > farther_[i] ? -shift_[i] : shift_[i]), d_shift);
+      d_per_strength += d_shift * along;
+      d_shift *= per_strength_;
       for (int c = 0; c < C(); c++) {
-        const vec contrast = clean_front_[c] - clean_behind_[c], off = light_[c * TAPS + i] + shift * contrast - clean_[c * TAPS + i];
-        of_light_[c * TAPS + i] += of_shift * contrast;
-        of_clean_[c * TAPS + i] -= of_shift * contrast;
-        of_contrast_[c] += of_shift * off;
+        const vec contrast = clean_front_[c] - clean_behind_[c],
+                  off = light_[c * TAPS + i] + shift * contrast - clean_[c * TAPS + i];
+        d_light_[c * TAPS + i] += d_shift * contrast;
+        d_clean_[c * TAPS + i] -= d_shift * contrast;
+        d_contrast_[c] += d_shift * off;
       }
     }
-    const vec of_strength = -of_per_strength * per_strength_ * per_strength_;
+    const vec d_strength = -d_per_strength * per_strength_ * per_strength_;
     for (int c = 0; c < C(); c++) {
-      of_contrast_[c] += 2.0f * of_strength * (clean_front_[c] - clean_behind_[c]);
-      of_front_[c] = of_contrast_[c], of_behind_[c] = -of_contrast_[c];
+      d_contrast_[c] += 2.0f * d_strength * (clean_front_[c] - clean_behind_[c]);
+      d_front_[c] = d_contrast_[c], d_behind_[c] = -d_contrast_[c];
     }
-    back_of_mean(clean_, nearer_, clean_front_, clean_near_variance_, of_front_, TEXTURE * of_strength, of_clean_, of_nearer);
-    back_of_mean(clean_, farther_, clean_behind_, clean_far_variance_, of_behind_, TEXTURE * of_strength, of_clean_, of_farther);
+    back_of_mean(clean_, nearer_, clean_front_, clean_near_variance_, d_front_, TEXTURE * d_strength, d_clean_,
+                 d_nearer);
+    back_of_mean(clean_, farther_, clean_behind_, clean_far_variance_, d_behind_, TEXTURE * d_strength, d_clean_,
+                 d_farther);
 
     const vec per_scale = 1.0f / scale_;
     for (int c = 0; c < C(); c++) {
-      of_light_[c * TAPS + TAPS / 2] += of_colour_[c];
+      d_light_[c * TAPS + TAPS / 2] += d_colour_[c];
       for (int i = 0; i < TAPS; i++) {
         const int at = c * EDGES * PITCH + first_ + tap(i);
-        add(&slopes.light[at], of_light_[c * TAPS + i] * per_scale);
-        add(&slopes.clean[at], only(size_of(load<vec>(&w_.clean[at]) * per_scale) <= all(MOST_CLEAN), of_clean_[c * TAPS + i] * per_scale));
+        add(&slopes.light[at], d_light_[c * TAPS + i] * per_scale);
+        add(&slopes.clean[at],
+            select(abs(load<vec>(&w_.clean[at]) * per_scale) <= MOST_CLEAN, d_clean_[c * TAPS + i] * per_scale));
       }
     }
-    add(slopes.edge + first_ + tap(TAPS / 2), of_edge_);
+    add(slopes.edge + first_ + tap(TAPS / 2), d_edge_);
     for (int i = 0; i < TAPS; i++) {
       const int in_coc = in_coc_ + tap(i);
-      const vec near_by = falloff_[i] * valid_[i], weight = (all(1.0f + UNCLEAN) - load<vec>(w_.edge + first_ + tap(i))) * near_by;
-      const vec nearness = (ends_.far - load<vec>(w_.coc + in_coc)) / gap_, to_near = 4.0f * nearness - 2.8f, to_far = 1.2f - 4.0f * nearness;
-      add(slopes.edge + first_ + tap(i), -near_by * (of_nearer[i] * clamp01(to_near) + of_farther[i] * clamp01(to_far)));
-      const vec of_ends = 4.0f * weight * (only(is_within(to_near), of_nearer[i]) - only(is_within(to_far), of_farther[i]));
-      const vec of_nearness = (of_ends + of_covered_ * small_[i] * per_counted_) / gap_;
-      add(slopes.coc + in_coc, -of_nearness);
-      of_far_ += of_nearness;
-      of_gap_ -= of_nearness * nearness;
+      const vec near_by = falloff_[i] * valid_[i],
+                weight = (broadcast(1.0f + UNCLEAN) - load<vec>(w_.edge + first_ + tap(i))) * near_by;
+      const vec nearness = (ends_.far - load<vec>(w_.coc + in_coc)) / gap_, to_near = 4.0f * nearness - 2.8f,
+                to_far = 1.2f - 4.0f * nearness;
+      add(slopes.edge + first_ + tap(i), -near_by * (d_nearer[i] * clamp01(to_near) + d_farther[i] * clamp01(to_far)));
+      const vec d_ends =
+          4.0f * weight * (select(is_within(to_near), d_nearer[i]) - select(is_within(to_far), d_farther[i]));
+      const vec d_nearness = (d_ends + d_covered_ * small_[i] * per_counted_) / gap_;
+      add(slopes.coc + in_coc, -d_nearness);
+      d_far_ += d_nearness;
+      d_gap_ -= d_nearness * nearness;
     }
-    add(slopes.coc + in_coc_ + tap(TAPS / 2), of_here_);
-    ends_.back(w_, in_coc_, masked_, of_near_ - of_gap_, of_far_ + of_gap_, slopes.coc);
+    add(slopes.coc + in_coc_ + tap(TAPS / 2), d_here_);
+    ends_.back(w_, in_coc_, masked_, d_near_ - d_gap_, d_far_ + d_gap_, slopes.coc);
   }
 
   int C() const { return CHANNELS ? CHANNELS : frame_.channels; }
@@ -563,24 +617,29 @@ class Split {
   const Frame &frame_;
   const Window &w_;
   const float *const falloff_;
-  const int y_, x_, first_, in_coc_;  // place in the block; of the first neighbour in windows of edges and light, and of coc
+  const int y_, x_, first_,
+      in_coc_;  // place in the block; of the first neighbour in windows of edges and light, and of coc
   const bool masked_;
   const Ends ends_;
-  vec *light_, *clean_, *of_light_, *of_clean_;  // of the neighbours [channels, TAPS]; gradients begin with of_
-  vec *front_, *behind_, *colour_, *clean_front_, *clean_behind_, *of_front_, *of_behind_, *of_colour_, *of_contrast_;  // [channels]
+  vec *light_, *clean_, *d_light_, *d_clean_;  // of the neighbours [channels, TAPS]; gradients begin with of_
+  vec *front_, *behind_, *colour_, *clean_front_, *clean_behind_, *d_front_, *d_behind_, *d_colour_,
+      *d_contrast_;  // [channels]
   vec valid_[TAPS], small_[TAPS];
-  vec nearer_[TAPS], farther_[TAPS];  // weights in the means of both surfaces
-  vec shift_[TAPS];  // not limited
+  vec nearer_[TAPS], farther_[TAPS];                               // weights in the means of both surfaces
+  vec shift_[TAPS];                                                // not limited
   vec scale_, here_, gap_, covered_, per_counted_, per_strength_;  // covered: by the near surface
   vec clean_near_variance_, clean_far_variance_, near_variance_, far_variance_;
   ivec is_near_;
   vec sharper_, lent_;  // px by which the other surface is less blurred; share of the residual that it may get, 0 to 1
-  vec strength_, along_, fitted_, misfit_, noise_, total_, trust_, edge_, sided_, clear_, contradiction_, by_fit_, by_cover_, wide_, geometric_, weight_;
-  vec of_weight_, of_variance_, of_covered_, of_edge_, of_here_, of_gap_, of_near_, of_far_;
+  vec strength_, along_, fitted_, misfit_, noise_, total_, trust_, edge_, sided_, clear_, contradiction_, by_fit_,
+      by_cover_, wide_, geometric_, weight_;
+  vec d_weight_, d_variance_, d_covered_, d_edge_, d_here_, d_gap_, d_near_, d_far_;
 };
 
 void read_light(const Frame &frame, int y0, int x0, Window &w) {
-  for (int c = 0; c < frame.channels; c++) read_window(frame, frame.light + c * frame.area(), y0 - RIM, x0 - RIM, EDGES, w.light.data() + (size_t)c * EDGES * PITCH);
+  for (int c = 0; c < frame.channels; c++)
+    read_window(frame, frame.light + c * frame.area(), y0 - RIM, x0 - RIM, EDGES,
+                w.light.data() + (size_t)c * EDGES * PITCH);
 }
 
 // Calls body(row, column, which are mixed) for each LANES pixels of a block that contain mixed ones.
@@ -588,7 +647,8 @@ template <typename Body>
 void each_mixed(const Frame &frame, int y0, int x0, const Window &w, const Body &body) {
   for (int y = 0; y < std::min(BLOCK, frame.height - y0); y++)
     for (int x = 0; x < std::min(BLOCK, frame.width - x0); x += LANES) {
-      const ivec beside = (load<vec>(w.edge + (y + RIM) * PITCH + x + RIM) > vec{}) & (counting() < (float)(frame.width - x0 - x));
+      const ivec beside =
+          (load<vec>(w.edge + (y + RIM) * PITCH + x + RIM) > vec{}) & (iota() < (float)(frame.width - x0 - x));
       if (any_of(beside)) body(y, x, beside);
     }
 }
@@ -598,21 +658,25 @@ void split_block(const Frame &frame, int by, int bx, Window &w, const float *fal
   read_light(frame, y0, x0, w);
   clean_light(frame, y0, x0, w, falloff);
   each_mixed(frame, y0, x0, w, [&](int y, int x, ivec beside) {
-    frame.channels == 3 ? Split<3>(frame, w, y, x, falloff).put(block, beside) : Split<0>(frame, w, y, x, falloff).put(block, beside);
+    frame.channels == 3 ? Split<3>(frame, w, y, x, falloff).put(block, beside)
+                        : Split<0>(frame, w, y, x, falloff).put(block, beside);
   });
 }
 
-// Adds the gradients by light and coc of a block's window, from those by the block's surfaces [2 channels + 2, height, width].
-void back_of_block(const Frame &frame, int by, int bx, Window &w, const float *falloff, const float *gradient, Slopes &slopes, float *const *of_maps) {
+// Adds the gradients by light and coc of a block's window, from those by the block's surfaces [2 channels + 2, height,
+// width].
+void back_of_block(const Frame &frame, int by, int bx, Window &w, const float *falloff, const float *gradient,
+                   Slopes &slopes, float *const *d_maps) {
   const int y0 = by * BLOCK, x0 = bx * BLOCK, C = frame.channels, plane = EDGES * PITCH;
   const bool has_edges = find_edges(frame, y0, x0, w);
-  for (int k = 0; k < 2 * C + 2; k++) read_window(frame, gradient + k * frame.area(), y0, x0, BLOCK, &slopes.surfaces[k * BLOCK * PITCH]);
+  for (int k = 0; k < 2 * C + 2; k++)
+    read_window(frame, gradient + k * frame.area(), y0, x0, BLOCK, &slopes.surfaces[k * BLOCK * PITCH]);
   for (int y = 0; y < std::min(BLOCK, frame.height - y0); y++)
     for (int x = 0; x < std::min(BLOCK, frame.width - x0); x++)
       if (!has_edges || !(w.edge[(y + RIM) * PITCH + x + RIM] > 0)) {  // a pixel of one surface stays as it is
         const size_t at = (size_t)(y0 + y) * frame.width + x0 + x;
-        for (int c = 0; c < C; c++) of_maps[0][c * frame.area() + at] += slopes.surfaces[(c * BLOCK + y) * PITCH + x];
-        of_maps[1][at] += slopes.surfaces[(2 * C * BLOCK + y) * PITCH + x];
+        for (int c = 0; c < C; c++) d_maps[0][c * frame.area() + at] += slopes.surfaces[(c * BLOCK + y) * PITCH + x];
+        d_maps[1][at] += slopes.surfaces[(2 * C * BLOCK + y) * PITCH + x];
       }
   if (!has_edges) return;
   read_light(frame, y0, x0, w);
@@ -622,7 +686,8 @@ void back_of_block(const Frame &frame, int by, int bx, Window &w, const float *f
   std::fill(slopes.light.begin(), slopes.light.end(), 0.0f);
   std::fill(slopes.clean.begin(), slopes.clean.end(), 0.0f);
   each_mixed(frame, y0, x0, w, [&](int y, int x, ivec beside) {
-    C == 3 ? Split<3>(frame, w, y, x, falloff).back(slopes, beside) : Split<0>(frame, w, y, x, falloff).back(slopes, beside);
+    C == 3 ? Split<3>(frame, w, y, x, falloff).back(slopes, beside)
+           : Split<0>(frame, w, y, x, falloff).back(slopes, beside);
   });
   clean_light(frame, y0, x0, w, falloff, &slopes);
   each_outside(frame, y0, x0, [&](int from, int to) {
@@ -634,175 +699,44 @@ void back_of_block(const Frame &frame, int by, int bx, Window &w, const float *f
       const int at = i * PITCH + j;
       const Ends ends(w, at, frame.valid);
       const vec rise = (ends.far - ends.near) * (1.0f / EDGE_PX) - 1.0f;
-      const vec slope = only(is_within(rise) & (load<vec>(w.edge + at) > vec{}), load<vec>(slopes.edge + at) * (1.0f / EDGE_PX));
+      const vec slope =
+          select(is_within(rise) & (load<vec>(w.edge + at) > vec{}), load<vec>(slopes.edge + at) * (1.0f / EDGE_PX));
       if (any_of(slope != vec{})) ends.back(w, at, frame.valid, -slope, slope, slopes.coc);
     }
   const auto add_window = [&](const float *window, int size, int margin, float *to) {
     for (int i = 0; i < size; i++)
       for (int j = 0; j < size; j++) {
-        const int y = std::clamp(y0 - margin + i, 0, frame.height - 1), x = std::clamp(x0 - margin + j, 0, frame.width - 1);
+        const int y = std::clamp(y0 - margin + i, 0, frame.height - 1),
+                  x = std::clamp(x0 - margin + j, 0, frame.width - 1);
         to[(size_t)y * frame.width + x] += window[i * PITCH + j];
       }
   };
-  for (int c = 0; c < C; c++) add_window(&slopes.light[c * plane], EDGES, RIM, of_maps[0] + c * frame.area());
-  add_window(slopes.coc, SIDE, MARGIN, of_maps[1]);
-}
-
-// Estimates from the pixels around a highlight on which surface its emitter lies.
-class Around {
- public:
-  // matted: compares the light of each pixel's own surface after matting, not that of the image.
-  Around(const Surfaces &s, int y, int x, const float *falloff, bool matted) : s_(s), falloff_(falloff), matted_(matted) {
-    for (int i = 0, dy = -EMITTER_REACH; dy <= EMITTER_REACH; dy++)
-      for (int dx = -EMITTER_REACH; dx <= EMITTER_REACH; dx++, i++) {
-        at_[i] = (size_t)std::clamp(y + dy, 0, s.height - 1) * s.width + std::clamp(x + dx, 0, s.width - 1);
-        coc_[i] = s.coc[at_[i]];
-        nearest_ = std::min(nearest_, coc_[i]);
-        farthest_ = std::max(farthest_, coc_[i]);
-        if (touches(i)) nearest_touching_ = std::min(nearest_touching_, coc_[i]);
-      }
-  }
-
-  // Confidence, 0 to 1, that the emitter lies on one side of the surface at `coc`. light: of the highlight's pixel;
-  // limit: the highlight threshold; share: minimum light on that side, relative to the surface's brightest pixel.
-  float certainty_beyond(float coc, Side side, float share, float light, float limit) {
-    if (!((side == BEHIND ? farthest_ - coc : coc - nearest_touching_) > 1)) return 0.0f;
-    if (!scale)
-      for (int i = 0; i < COUNT; i++) {
-        scale = std::max(scale, peaks_[i] = peak_of(s_.light + at_[i], s_.area(), s_.channels));
-        if (!matted_) continue;
-        const int row = (int)(at_[i] / s_.width), column = (int)(at_[i] % s_.width), which = s_.block_of(row, column);
-        if (s_.has_block(which)) peaks_[i] = peak_of(s_.block(which).own + place_in_block(row, column), BLOCK_PIXELS, s_.channels);
-      }
-    const float own_peak = light / scale, dim_below = 5.0f / std::max(own_peak, 1e-12f);
-    float dim_sum = 0, emitter_peak = 0, same_peak = std::max(LEAST_PEAK * own_peak, 1e-12f);  // a ratio of tiny peaks would depend on rounding
-    for (int i = 0; i < COUNT; i++) {
-      const float counted = s_.valid ? s_.valid[at_[i]] : 1.0f, peak = peaks_[i] / scale, away = side * (coc_[i] - coc);
-      const float same = counted * clamp01(2.0f - std::fabs(away));
-      there_[i] = side == BEHIND || touches(i) ? counted * clamp01(away - 1.0f) : 0.0f;
-      dim_[i] = same * falloff_[i] * clamp01(2.5f - dim_below * peak);
-      dim_sum += dim_[i];
-      emitter_peak = std::max(emitter_peak, there_[i] * peak);
-      same_peak = std::max(same_peak, same * peak);
-    }
-    top = std::max(emitter_peak, same_peak);
-    return clamp01(light / limit - 1.0f) * std::min(10.0f * dim_sum, 1.0f) * clamp01(10.0f * (emitter_peak / same_peak - share));
-  }
-
-  // For the last call of `certainty_beyond`: returns the emitter's coc; surface: light of the surface's darkest pixels.
-  float measure_emitter(float light, std::vector<float> &surface) const {
-    const float own_peak = light / scale, least_dim = DIM * own_peak;
-    float dimmest_sum = 0, lit_sum = 0, lit_coc = 0;
-    surface.assign(s_.channels, 0.0f);
-    for (int i = 0; i < COUNT; i++) {
-      const float peak = peaks_[i] / scale, brightness = std::min(peak * peak, 1e30f);
-      const float dimmest = dim_[i] / std::max(brightness + least_dim * least_dim, 1e-24f), lit = there_[i] * falloff_[i] * brightness;
-      dimmest_sum += dimmest;
-      for (int c = 0; c < s_.channels; c++) surface[c] += s_.light[c * s_.area() + at_[i]] / scale * dimmest;
-      lit_sum += lit;
-      lit_coc += (coc_[i] - nearest_) * lit;
-    }
-    for (float &colour : surface) colour /= std::max(dimmest_sum, 1e-12f);
-    return nearest_ + lit_coc / std::max(lit_sum, 1e-12f);
-  }
-
- private:
-  static constexpr int ACROSS = 2 * EMITTER_REACH + 1, COUNT = ACROSS * ACROSS;
-  static bool touches(int i) { return std::abs(i / ACROSS - EMITTER_REACH) <= TOUCHING && std::abs(i % ACROSS - EMITTER_REACH) <= TOUCHING; }
-  const Surfaces &s_;
-  const float *falloff_;
-  const bool matted_;
-  size_t at_[COUNT];
-  float coc_[COUNT], peaks_[COUNT], there_[COUNT], dim_[COUNT], nearest_ = NEVER, nearest_touching_ = NEVER, farthest_ = -NEVER;
-
- public:
-  float scale = 0, top = 0;  // scale: largest light around; top: largest light of both surfaces, relative to scale
-};
-
-// The highlight threshold of a pixel, if its light is above it; else 0.
-float limit_of_highlight(const Job &job, int y, int x, float light, float least_limit) {
-  const Surfaces &s = job.surfaces;
-  if (!(light > least_limit) || (s.valid && !(s.valid[(size_t)y * s.width + x] > 0))) return 0.0f;
-  const float limit = threshold_at(job, y, x);
-  return light > limit ? limit : 0.0f;
-}
-
-// The own surface keeps what the other surface does not take.
-void set_weight(const Surfaces &s, const Block &block, size_t at, int within, float weight) {
-  for (int c = 0; c < s.channels; c++)
-    block.own[c * BLOCK_PIXELS + within] = (s.light[c * s.area() + at] - weight * block.other[c * BLOCK_PIXELS + within]) / (1.0f - weight);
-  block.weight[within] = weight;
-  block.own_weight[within] = 1.0f - weight;
+  for (int c = 0; c < C; c++) add_window(&slopes.light[c * plane], EDGES, RIM, d_maps[0] + c * frame.area());
+  add_window(slopes.coc, SIDE, MARGIN, d_maps[1]);
 }
 
 // Gives pixels of a block the second surfaces of a matte, by their certainty; see render/surfaces/coverage.py.
 void cover_block(Job &job, int by, int bx) {
   Surfaces &s = job.surfaces;
   const size_t area = s.area();
-  const float *const part = job.scene.covered, *const coc = part + s.channels * area, *const weight = coc + area, *const certainty = weight + area;
+  const float *const part = job.scene.covered, *const coc = part + s.channels * area, *const weight = coc + area,
+                     *const certainty = weight + area;
   for (int y = by * BLOCK; y < std::min(s.height, (by + 1) * BLOCK); y++)
     for (int x = bx * BLOCK; x < std::min(s.width, (bx + 1) * BLOCK); x++) {
       const size_t at = (size_t)y * s.width + x;
       if (!(certainty[at] > 0)) continue;
       const Block block = s.make_block(by * s.block_columns + bx);
       const int within = place_in_block(y, x);
-      const float kept = (1.0f - certainty[at]) * block.weight[within], given = certainty[at] * weight[at], both = kept + given;
+      const float kept = (1.0f - certainty[at]) * block.weight[within], given = certainty[at] * weight[at],
+                  both = kept + given;
       const float per = both > 0 ? 1.0f / std::max(both, 1e-12f) : 0.0f;
       for (int c = 0; c < s.channels; c++) {
         float &other = block.other[c * BLOCK_PIXELS + within];
         other = (kept * other + certainty[at] * part[c * area + at] * s.light[c * area + at]) * per;
       }
       if (both > 0) block.coc[within] = (kept * block.coc[within] + given * coc[at]) * per;
-      set_weight(s, block, at, within, both);
+      s.set_weight(block, at, within, both);
     }
-}
-
-// Assigns the light of a highlight's pixel to the surface of its emitter, in front of the pixel's own surface or behind.
-void attribute_emitter(Job &job, int y, int x, float least_limit, const float *falloff) {
-  Surfaces &s = job.surfaces;
-  const int channels = job.channels;
-  const size_t at = (size_t)y * s.width + x, area = s.area();
-  const float light = peak_of(s.light + at, area, channels), own_coc = s.coc[at];
-  const float limit = limit_of_highlight(job, y, x, light, least_limit);
-  if (!(limit > 0)) return;
-  Around around(s, y, x, falloff, false);
-  const int i = s.block_of(y, x), within = place_in_block(y, x);
-  std::vector<float> surface;
-  for (const Side side : {IN_FRONT, BEHIND}) {
-    float sureness = around.certainty_beyond(own_coc, side, side == IN_FRONT ? 1.0f : 0.5f, light, limit);
-    if (!(sureness > 0)) continue;
-    const Block block = s.make_block(i);
-    const float coc = around.measure_emitter(light, surface), floor = *std::max_element(surface.begin(), surface.end());
-    const float share = clamp((light / around.scale - floor) / std::max(around.top - floor, 1e-12f), 1.0f - MOST_WEIGHT, MOST_WEIGHT);
-    // an emitter seen behind a surface is not in front of it
-    if (side == IN_FRONT) sureness *= 1.0f - around.certainty_beyond(coc, BEHIND, 0.5f, light, limit);
-    const float given = std::max(side == IN_FRONT ? sureness : 2.0f * sureness - 1.0f, 0.0f);
-    const float kept = std::max(side == IN_FRONT ? 1.0f - sureness : 1.0f - 2.0f * sureness, 0.0f) * block.weight[within];
-    const float weight = kept + given * share, per_weight = weight > 0 ? 1.0f / std::max(weight, 1e-12f) : 0.0f;
-    for (int c = 0; c < channels; c++) {
-      const float emitter = std::max(s.light[c * area + at] / around.scale - (1.0f - share) * surface[c], 0.0f) * around.scale;
-      float &other = block.other[c * BLOCK_PIXELS + within];
-      other = (kept * other + given * emitter) * per_weight;
-    }
-    block.coc[within] += given * share * per_weight * (coc - block.coc[within]);
-    set_weight(s, block, at, within, weight);
-  }
-}
-
-// Factor of the other surface's weight in a highlight's pixel, below 1 if the emitter lies on the pixel's own surface:
-// the other surface is dark around the pixel, after light of emitters seen through it was taken from it.
-float weight_left(const Job &job, int y, int x, float least_limit, const float *falloff) {
-  const Surfaces &s = job.surfaces;
-  const int i = s.block_of(y, x), within = place_in_block(y, x);
-  const size_t at = (size_t)y * s.width + x;
-  const float light = peak_of(s.light + at, s.area(), s.channels), limit = limit_of_highlight(job, y, x, light, least_limit);
-  const Block block = s.block(i);
-  if (!(limit > 0) || !(block.weight[within] > 0)) return 1.0f;
-  const float bright = clamp01(peak_of(block.other + within, BLOCK_PIXELS, s.channels) / std::max(limit, TINY) - 1.0f);
-  const float beyond = s.coc[at] - block.coc[within], taken = bright * clamp01(std::fabs(beyond) - 1.0f);
-  if (!(taken > 0)) return 1.0f;
-  Around around(s, y, x, falloff, true);
-  return 1.0f - taken * around.certainty_beyond(block.coc[within], beyond > 0 ? BEHIND : IN_FRONT, 1.0f, light, limit);
 }
 
 std::vector<float> falloff_around(int reach) {
@@ -814,38 +748,17 @@ std::vector<float> falloff_around(int reach) {
 
 }  // namespace
 
-Block Surfaces::make_block(int i) {
-  if (blocks[i]) return block(i);
-  const size_t size = (size_t)(2 * channels + 3) * BLOCK_PIXELS;
-  {
-    std::lock_guard<std::mutex> lock(mutex_);
-    if (!blocks_left_) {
-      memory_.emplace_back(BLOCKS_AT_ONCE * size);
-      blocks_left_ = BLOCKS_AT_ONCE;
-    }
-    blocks[i] = memory_.back().data() + --blocks_left_ * size;
-  }
-  memset(blocks[i], 0, size * sizeof(float));
-  const Block made = block(i);
-  const int y0 = i / block_columns * BLOCK, x0 = i % block_columns * BLOCK;
-  const int rows = std::min(BLOCK, height - y0), columns = std::min(BLOCK, width - x0);
-  for (int y = 0; y < rows; y++) {
-    const size_t from = (size_t)(y0 + y) * width + x0;
-    for (int c = 0; c < channels; c++)
-      memcpy(made.own + c * BLOCK_PIXELS + y * BLOCK, light + c * area() + from, columns * sizeof(float));
-    memcpy(made.coc + y * BLOCK, coc + from, columns * sizeof(float));
-    for (int x = 0; x < columns; x++) made.own_weight[y * BLOCK + x] = valid ? valid[from + x] : 1.0f;
-  }
-  return made;
-}
-
 void Job::split_mixed() {
   const std::vector<float> falloff = falloff_around(REACH), around_emitter = falloff_around(EMITTER_REACH);
   const bool emitters = scene.kind != TORCHDOF_BACKGROUND;  // a given background replaces the light behind
   const int rows = surfaces.block_rows, columns = surfaces.block_columns;
-  const Frame frame{height, width, channels, surfaces.light, surfaces.coc, surfaces.valid, light_least.data(), light_most.data()};
+  const Frame frame{height,       width,          channels,           surfaces.light,
+                    surfaces.coc, surfaces.valid, light_least.data(), light_most.data()};
   std::vector<std::unique_ptr<Window>> windows(std::max(1, scene.threads));
-  struct Left { int y, x; float weight; };
+  struct Left {
+    int y, x;
+    float weight;
+  };
   std::vector<std::vector<Left>> left(rows);  // other surfaces of highlights' pixels
   const auto each_highlight = [&](int by, int bx, const auto &body) {
     if (!emitters) return;
@@ -870,7 +783,9 @@ void Job::split_mixed() {
         split_block(frame, by, bx, w, falloff.data(), surfaces.make_block(by * columns + bx));
       if (scene.covered) cover_block(*this, by, bx);
       if (!(high - low > 1)) continue;
-      each_highlight(by, bx, [&](int y, int x, float least_limit) { attribute_emitter(*this, y, x, least_limit, around_emitter.data()); });
+      each_highlight(by, bx, [&](int y, int x, float least_limit) {
+        attribute_emitter(*this, y, x, least_limit, around_emitter.data());
+      });
     }
   });
   parallel(rows, [&](int by, int) {
@@ -885,7 +800,7 @@ void Job::split_mixed() {
     for (const Left &l : row) {
       const Block block = surfaces.block(surfaces.block_of(l.y, l.x));
       const int within = place_in_block(l.y, l.x);
-      set_weight(surfaces, block, (size_t)l.y * width + l.x, within, l.weight * block.weight[within]);
+      surfaces.set_weight(block, (size_t)l.y * width + l.x, within, l.weight * block.weight[within]);
     }
 }
 
@@ -903,7 +818,8 @@ void Job::add_background() {
       const bool mixed = surfaces.row(1, y, x, other.data(), other_coc, weight);
       bool known = std::isfinite(scene.coc[1][at]);
       for (int c = 0; c < channels; c++) known &= std::isfinite(scene.light[1][c * area + at]);
-      const float here = surfaces.coc[at], there = clamp(scene.coc[1][at], low, high), apart = clamp01(there - here - SAME_PX);
+      const float here = surfaces.coc[at], there = std::clamp(scene.coc[1][at], low, high),
+                  apart = clamp01(there - here - SAME_PX);
       // a given background replaces the farther surface of a mixed pixel
       const float share = mixed && *other_coc < here ? *weight : 0.0f;
       for (int c = 0; c < channels; c++) {
@@ -931,9 +847,10 @@ void Job::add_background() {
 
 // The surfaces of an image [2 channels + 2, height, width]: own and other light, coc and weight of the other; or, given
 // their gradient, the gradients by light and coc.
-static void matte(const float *const *maps, int channels, int height, int width, int threads, float *out, const float *gradient, float *const *of_maps) {
+static void matte(const float *const *maps, int channels, int height, int width, int threads, float *out,
+                  const float *gradient, float *const *d_maps) {
   const int C = channels, rows = ceil_div(height, BLOCK), columns = ceil_div(width, BLOCK);
-  std::vector<float> darkest(C), brightest(C), of_range((size_t)rows * 2 * C);
+  std::vector<float> darkest(C), brightest(C), d_range((size_t)rows * 2 * C);
   const size_t area = (size_t)height * width;
   for (int c = 0; c < C; c++) find_ends(maps[0] + c * area, area, threads, &darkest[c], &brightest[c]);
   const Frame frame{height, width, C, maps[0], maps[1], maps[2], darkest.data(), brightest.data()};
@@ -950,10 +867,12 @@ static void matte(const float *const *maps, int channels, int height, int width,
       for (int bx = 0; bx < columns; bx++) {
         const int y0 = by * BLOCK, x0 = bx * BLOCK;
         if (!find_edges(frame, y0, x0, w)) continue;
-        split_block(frame, by, bx, w, falloff.data(), {plane(0), plane(C), plane(2 * C), plane(2 * C + 1), plane(2 * C + 2)});
+        split_block(frame, by, bx, w, falloff.data(),
+                    {plane(0), plane(C), plane(2 * C), plane(2 * C + 1), plane(2 * C + 2)});
         each_mixed(frame, y0, x0, w, [&](int y, int x, ivec beside) {
           for (int lane = 0; lane < LANES; lane++)
-            for (int k = 0; beside[lane] && k < 2 * C + 2; k++) out[k * area + (size_t)(y0 + y) * width + x0 + x + lane] = plane(k)[y * BLOCK + x + lane];
+            for (int k = 0; beside[lane] && k < 2 * C + 2; k++)
+              out[k * area + (size_t)(y0 + y) * width + x0 + x + lane] = plane(k)[y * BLOCK + x + lane];
         });
       }
     });
@@ -964,23 +883,23 @@ static void matte(const float *const *maps, int channels, int height, int width,
       const int by = 2 * i + first;
       Window w(C);
       Slopes slopes(C);
-      for (int bx = 0; bx < columns; bx++) back_of_block(frame, by, bx, w, falloff.data(), gradient, slopes, of_maps);
-      std::copy(slopes.darkest.begin(), slopes.darkest.end(), &of_range[(size_t)by * 2 * C]);
-      std::copy(slopes.brightest.begin(), slopes.brightest.end(), &of_range[(size_t)by * 2 * C + C]);
+      for (int bx = 0; bx < columns; bx++) back_of_block(frame, by, bx, w, falloff.data(), gradient, slopes, d_maps);
+      std::copy(slopes.darkest.begin(), slopes.darkest.end(), &d_range[(size_t)by * 2 * C]);
+      std::copy(slopes.brightest.begin(), slopes.brightest.end(), &d_range[(size_t)by * 2 * C + C]);
     });
   for (int k = 0; k < 2 * C; k++) {  // the pixels with the extremes share their gradients
     float slope = 0;
-    for (int by = 0; by < rows; by++) slope += of_range[(size_t)by * 2 * C + k];
+    for (int by = 0; by < rows; by++) slope += d_range[(size_t)by * 2 * C + k];
     const float *const light = maps[0] + k % C * area, extreme = k < C ? darkest[k] : brightest[k - C];
     slope /= (float)std::count(light, light + area, extreme);
     for (size_t at = 0; slope != 0 && at < area; at++)
-      if (light[at] == extreme) of_maps[0][k % C * area + at] += slope;
+      if (light[at] == extreme) d_maps[0][k % C * area + at] += slope;
   }
 }
 
 }  // namespace torchdof
 
-int32_t torchdof_matte(const float *const *maps, int32_t channels, int32_t height, int32_t width, int32_t threads, float *out,
-                       const float *gradient, float *const *of_maps) {
-  return torchdof::guarded([&] { torchdof::matte(maps, channels, height, width, threads, out, gradient, of_maps); });
+int32_t torchdof_matte(const float *const *maps, int32_t channels, int32_t height, int32_t width, int32_t threads,
+                       float *out, const float *gradient, float *const *d_maps) {
+  return torchdof::guarded([&] { torchdof::matte(maps, channels, height, width, threads, out, gradient, d_maps); });
 }

@@ -1,11 +1,30 @@
 // Rules of the picture, each in one place: its formula, the Python function that defines it, and for the gradients its
 // derivative. A rule without its limits to [0, 1] is named `unlimited`: the derivative is that of the limited one where
-// `within` holds, and 0 elsewhere. Templates are for a float and for a vector of pixels; a layer is any type with the ends and
-// slopes of its ramps.
+// `within` holds, and 0 elsewhere. Templates are for a float and for a vector of pixels; a layer is any type with the
+// ends and slopes of its ramps. Of the standard library only cstdint is included.
 #pragma once
+#include "constants/composite.h"
+#include "constants/disocclusion.h"
+#include "constants/frame.h"
+#include "constants/layer_weights.h"
 #include "numbers.h"
 
 namespace torchdof {
+
+// Constants of Python modules, which give their meanings, units and effects; here with the type of the computations.
+constexpr float KNOWN = constants::composite::KNOWN;
+constexpr float BEHIND_PX = constants::disocclusion::BEHIND_PX;
+constexpr float OWN_SLOPE = constants::disocclusion::OWN_SLOPE;
+constexpr float FOOT = constants::layer_weights::FOOT;
+constexpr float HIDDEN_WEIGHT = constants::frame::HIDDEN_WEIGHT;
+constexpr float HIDING_SHARE = constants::frame::HIDING_SHARE;
+constexpr float LEAST_PASSING = constants::frame::LEAST_PASSING;
+constexpr float CONTINUES_FROM = constants::frame::CONTINUES_FROM;
+constexpr float AT_FOCUS = constants::frame::AT_FOCUS;
+constexpr float OFF_FOCUS = constants::frame::OFF_FOCUS;
+constexpr float BARELY_BLURRED = constants::frame::BARELY_BLURRED;
+constexpr float COUNTED = constants::frame::COUNTED;
+constexpr float SEEN_FROM = constants::frame::SEEN_FROM;
 
 // Whether 0 <= v <= 1.
 template <typename V>
@@ -13,14 +32,14 @@ inline auto within(V v) {
   return (v >= V{}) & (v <= V{} + 1.0f);
 }
 
-// Largest coc of a pixel's own surface nearby, which may slope: c + max(OWN_SLOPE |c| - BEHIND_PX, 0); and its derivative.
-// render/surfaces/disocclusion.py, end_of_surface.
+// Largest coc of a pixel's own surface nearby, which may slope: c + max(OWN_SLOPE |c| - BEHIND_PX, 0); and its
+// derivative. render/surfaces/disocclusion.py, end_of_surface.
 template <typename V>
 inline V end_of_surface(V coc) {
-  return coc + most(most(coc, -coc) * OWN_SLOPE - BEHIND_PX, V{});
+  return coc + max(max(coc, -coc) * OWN_SLOPE - BEHIND_PX, V{});
 }
 inline float slope_of_end(float coc) {
-  return OWN_SLOPE * most(coc, -coc) >= BEHIND_PX ? 1.0f + (coc < 0 ? -OWN_SLOPE : OWN_SLOPE) : 1.0f;
+  return OWN_SLOPE * max(coc, -coc) >= BEHIND_PX ? 1.0f + (coc < 0 ? -OWN_SLOPE : OWN_SLOPE) : 1.0f;
 }
 
 // Confidence that a surface whose coc is larger by d is another surface: clamp(d - BEHIND_PX + 1/2, 0, 1).
@@ -34,7 +53,8 @@ inline V is_another_surface(V distance_px) {
   return clamp01(unlimited_another_surface(distance_px));
 }
 
-// How much a pixel reads a level of the pyramid: clamp(|c| / least_px - 1, 0, 1). render/surfaces/disocclusion.py, is_read.
+// How much a pixel reads a level of the pyramid: clamp(|c| / least_px - 1, 0, 1). render/surfaces/disocclusion.py,
+// is_read.
 template <typename V>
 inline V unlimited_read(V size_px, float least_px) {
   return size_px * (1.0f / least_px) - 1.0f;  // least_px is a power of two: no rounding
@@ -44,12 +64,13 @@ inline V is_read(V size_px, float least_px) {
   return clamp01(unlimited_read(size_px, least_px));
 }
 
-// A ramp from 0 to 1 with a parabola as its foot, up to FOOT; exact at both ends. render/layers/layer_weights.py, eased.
+// A ramp from 0 to 1 with a parabola as its foot, up to FOOT; exact at both ends. render/layers/layer_weights.py,
+// eased.
 constexpr float SLOPE = 1 / (1 - FOOT / 2);  // of the straight part
 template <typename V>
 inline V eased(V v) {
-  const V foot = least(v, V{} + FOOT);
-  return most(1.0f - SLOPE * (1.0f - v), SLOPE / (2 * FOOT) * foot * foot);
+  const V foot = min(v, V{} + FOOT);
+  return max(1.0f - SLOPE * (1.0f - v), SLOPE / (2 * FOOT) * foot * foot);
 }
 // The ramp clamp(v, 0, 1), eased or not, and its derivative.
 template <typename V>
@@ -82,8 +103,9 @@ inline V behind(const L &l, V place, bool ease) {
   return ramp(unlimited_behind(l, place), ease);
 }
 
-// The farther surface of a mixed pixel, whose share of the pixel is w, continues behind the nearer one with the extra weight
-// (1 - w) clamp((w - HIDDEN_WEIGHT) / CONTINUES_FROM, 0, 1); and the derivative. render/surfaces/frame.py, continuation_weight.
+// The farther surface of a mixed pixel, whose share of the pixel is w, continues behind the nearer one with the extra
+// weight (1 - w) clamp((w - HIDDEN_WEIGHT) / CONTINUES_FROM, 0, 1); and the derivative. render/surfaces/frame.py,
+// continuation_weight.
 template <typename V>
 inline V unlimited_known(V share) {
   return (share - HIDDEN_WEIGHT) * (1.0f / CONTINUES_FROM);
@@ -109,46 +131,75 @@ inline V slope_of_visible_part(V nearer) {
   return within(nearer * (1.0f / HIDING_SHARE)) ? V{} - 1.0f / HIDING_SHARE : V{};
 }
 
-// Stand-ins for the background, each rule with its derivative. A surface at x counts as one at the focus by clamp(1 + x /
-// AT_FOCUS, 0, 1), and stands in by clamp(2 + x / BARELY_BLURRED, 0, 1) clamp(-x / OFF_FOCUS, 0, 1). With the weight w it takes
-// the place of a stand-in by clamp(COUNTED w, 0, 1), and has the weight max(w - SEEN_FROM, 0) as one. render/surfaces/frame.py,
-// at_focus, stands_in, counts and seen.
+// Stand-ins for the background, each rule with its derivative. A surface at x counts as one at the focus by clamp(1 + x
+// / AT_FOCUS, 0, 1), and stands in by clamp(2 + x / BARELY_BLURRED, 0, 1) clamp(-x / OFF_FOCUS, 0, 1). With the weight
+// w it takes the place of a stand-in by clamp(COUNTED w, 0, 1), and has the weight max(w - SEEN_FROM, 0) as one.
+// render/surfaces/frame.py, at_focus, stands_in, counts and seen.
 template <typename V>
-inline V unlimited_at_focus(V place) { return place * (1.0f / AT_FOCUS) + 1.0f; }
+inline V unlimited_at_focus(V place) {
+  return place * (1.0f / AT_FOCUS) + 1.0f;
+}
 template <typename V>
-inline V at_focus(V place) { return clamp01(unlimited_at_focus(place)); }
+inline V at_focus(V place) {
+  return clamp01(unlimited_at_focus(place));
+}
 template <typename V>
-inline V slope_of_at_focus(V place) { return within(unlimited_at_focus(place)) ? V{} + 1.0f / AT_FOCUS : V{}; }
+inline V slope_of_at_focus(V place) {
+  return within(unlimited_at_focus(place)) ? V{} + 1.0f / AT_FOCUS : V{};
+}
 template <typename V>
-inline V unlimited_stand_in(V place) { return place * (1.0f / BARELY_BLURRED) + 2.0f; }
+inline V unlimited_stand_in(V place) {
+  return place * (1.0f / BARELY_BLURRED) + 2.0f;
+}
 template <typename V>
-inline V unlimited_off_focus(V place) { return place * (-1.0f / OFF_FOCUS); }
+inline V unlimited_off_focus(V place) {
+  return place * (-1.0f / OFF_FOCUS);
+}
 template <typename V>
-inline V stands_in(V place) { return clamp01(unlimited_stand_in(place)) * clamp01(unlimited_off_focus(place)); }
+inline V stands_in(V place) {
+  return clamp01(unlimited_stand_in(place)) * clamp01(unlimited_off_focus(place));
+}
 template <typename V>
 inline V slope_of_stands_in(V place) {  // 0 where it is 0
   const V in = unlimited_stand_in(place), off = unlimited_off_focus(place);
-  const V slope = (in <= V{} + 1.0f ? clamp01(off) * (1.0f / BARELY_BLURRED) : V{}) - (off <= V{} + 1.0f ? clamp01(in) * (1.0f / OFF_FOCUS) : V{});
+  const V slope = (in <= V{} + 1.0f ? clamp01(off) * (1.0f / BARELY_BLURRED) : V{}) -
+                  (off <= V{} + 1.0f ? clamp01(in) * (1.0f / OFF_FOCUS) : V{});
   return stands_in(place) > V{} ? slope : V{};
 }
 template <typename V>
-inline V seen(V weight) { return most(weight - SEEN_FROM, V{}); }
+inline V seen(V weight) {
+  return max(weight - SEEN_FROM, V{});
+}
 template <typename V>
-inline V slope_of_seen(V weight) { return weight > SEEN_FROM ? V{} + 1.0f : V{}; }
+inline V slope_of_seen(V weight) {
+  return weight > SEEN_FROM ? V{} + 1.0f : V{};
+}
 template <typename V>
-inline V unlimited_counts(V weight) { return weight * COUNTED; }
+inline V unlimited_counts(V weight) {
+  return weight * COUNTED;
+}
 template <typename V>
-inline V counts(V weight) { return clamp01(unlimited_counts(weight)); }
+inline V counts(V weight) {
+  return clamp01(unlimited_counts(weight));
+}
 template <typename V>
-inline V slope_of_counts(V weight) { return within(unlimited_counts(weight)) ? V{} + COUNTED : V{}; }
+inline V slope_of_counts(V weight) {
+  return within(unlimited_counts(weight)) ? V{} + COUNTED : V{};
+}
 
-// The normalizer of a layer, its weight w plus the weight v behind it, is raised where it is small: with l = max(KNOWN - w -
-// v, 0), by l^2 / (2 KNOWN), whose derivative by w or v is -l / KNOWN. render/layers/composite.py, raised.
+// The normalizer of a layer, its weight w plus the weight v behind it, is raised where it is small: with l = max(KNOWN
+// - w - v, 0), by l^2 / (2 KNOWN), whose derivative by w or v is -l / KNOWN. render/layers/composite.py, raised.
 template <typename V>
-inline V lacking(V weight, V behind = V{}) { return most(V{} + KNOWN - weight - behind, V{}); }
+inline V lacking(V weight, V behind = V{}) {
+  return max(V{} + KNOWN - weight - behind, V{});
+}
 template <typename V>
-inline V raise(V lacking) { return lacking * lacking * (0.5f / KNOWN); }
+inline V raise(V lacking) {
+  return lacking * lacking * (0.5f / KNOWN);
+}
 template <typename V>
-inline V slope_of_raise(V lacking) { return lacking * (-1.0f / KNOWN); }
+inline V slope_of_raise(V lacking) {
+  return lacking * (-1.0f / KNOWN);
+}
 
 }  // namespace torchdof

@@ -28,28 +28,29 @@ enum {
 
 // Transmittance of the lens's field over a kernel; see optics/placed_kernels.py.
 typedef struct {
-  const float *values;     // [colours, distances, rows, columns]
+  const float *values;  // [colours, distances, rows, columns]
   // [distances, 3]: where the samples lie: offset of their centre along the radius, half length, half width
   const float *boxes;
-  float radius;            // signed coc in pixels of the layer
-  int32_t colours;         // 1 or channels
+  float radius;     // signed coc in pixels of the layer
+  int32_t colours;  // 1 or channels
   int32_t rows, columns;
 } torchdof_field_mask;
 
 typedef struct {
   int32_t height, width, channels;
-  int32_t kind;                // TORCHDOF_IMAGE, _BACKGROUND or _STACK
-  int32_t surfaces;            // number of surfaces: 1, 2, or any number
-  const float *const *light;   // for each surface [channels, height, width]
-  const float *const *coc;     // for each surface [height, width]: signed radius in pixels, negative in front of the focus
+  int32_t kind;               // TORCHDOF_IMAGE, _BACKGROUND or _STACK
+  int32_t surfaces;           // number of surfaces: 1, 2, or any number
+  const float *const *light;  // for each surface [channels, height, width]
+  const float *const *coc;  // for each surface [height, width]: signed radius in pixels, negative in front of the focus
   const float *const *weight;  // for each surface [height, width], or null: it covers its pixels fully
-  const float *covered;        // second surfaces that a matte gives [channels + 3, height, width], or null; see render/surfaces/coverage.py
+  const float *covered;        // second surfaces that a matte gives [channels + 3, height, width], or null; see
+                               // render/surfaces/coverage.py
   int32_t occlusion;           // 0: light of all surfaces is added, without occlusion
   int32_t normalize;           // 0: without occlusion, do not divide by the blurred weight
   int32_t masked;  // 1: inputs may be NaN or infinite (not in a stack); such pixels are copied and do not affect others
-  int32_t highlights;          // 0: highlights are blurred with their layers
-  float crisp_px;              // blur in pixels above which layers soften the outlines of highlights
-  float reach;                 // radius of the widest kernel divided by the radius of its disc, at least 1
+  int32_t highlights;  // 0: highlights are blurred with their layers
+  float crisp_px;      // blur in pixels above which layers soften the outlines of highlights
+  float reach;         // radius of the widest kernel divided by the radius of its disc, at least 1
 
   int32_t layers;          // near to far
   const double *nodes;     // positions of the layers on the blur axis, strictly increasing
@@ -59,8 +60,8 @@ typedef struct {
   const float *kernels;    // for each layer [kernel_colours, 2 half + 1, 2 half + 1]
 
   const torchdof_field_mask *field_masks;  // for each layer; null: kernels do not change across the frame
-  int32_t distances;              // number of field distances, from the centre of the frame to its corner
-  float squeeze;                  // height of the blur divided by its width
+  int32_t distances;                       // number of field distances, from the centre of the frame to its corner
+  float squeeze;                           // height of the blur divided by its width
 
   int32_t threads;
   const volatile int32_t *cancelled;  // rendering stops soon after it becomes 1
@@ -68,8 +69,8 @@ typedef struct {
 
 // out = scale (1 / s - 1 / z): signed coc of depths z [count] in metres; s is nearest or farthest, and depths between
 // them are in focus. NaN where z is not > 0.
-TORCHDOF_API int32_t torchdof_coc(const float *depth, int64_t count, float scale, float nearest, float farthest, int32_t threads,
-                                  float *out);
+TORCHDOF_API int32_t torchdof_coc(const float *depth, int64_t count, float scale, float nearest, float farthest,
+                                  int32_t threads, float *out);
 
 // Positions of the layers on the blur axis, near to far, for maps of coc [maps, height, width] of one frame. count:
 // number of layers; nodes is written if they fit into its capacity. tolerance: reduced for a small frame.
@@ -101,8 +102,8 @@ TORCHDOF_API int32_t torchdof_begin(const torchdof_scene *scene, torchdof_job **
 // Signed radii of highlights in steps of 1/32 pixel; returns their number.
 TORCHDOF_API int64_t torchdof_radii(const torchdof_job *job, const int32_t **steps);
 
-// kernels[i] is for radius i: [kernel_colours, 2 halves[i] + 1, 2 halves[i] + 1]. field_masks: field masks, at least two, in
-// ascending order of radius; null if layers have no masks. out: [channels, height, width].
+// kernels[i] is for radius i: [kernel_colours, 2 halves[i] + 1, 2 halves[i] + 1]. field_masks: field masks, at least
+// two, in ascending order of radius; null if layers have no masks. out: [channels, height, width].
 TORCHDOF_API int32_t torchdof_finish(torchdof_job *job, const float *const *kernels, const int32_t *halves,
                                      const torchdof_field_mask *field_masks, int32_t field_masks_count, float *out);
 
@@ -114,7 +115,7 @@ typedef struct {
   int32_t height, width, channels;
   const float *light;     // [channels, height, width]
   const float *nearness;  // [height, width]
-  int32_t of_coc;         // 1: `nearness` is coc
+  int32_t is_coc;         // 1: `nearness` is coc
   const float *steps;     // smallest difference between two surfaces [height, width], or null:
   float step;             // the same for all pixels
   int32_t automatic;      // 1: leave a map with exact edges unchanged
@@ -128,18 +129,18 @@ TORCHDOF_API int32_t torchdof_repair_edges(const torchdof_map *map, int32_t *cha
 
 // A padded frame whose layers are blurred and composited: surfaces of each pixel, all of them with a margin.
 typedef struct {
-  int32_t rows, columns;         // of the maps; multiples of the largest scale, as is the margin
-  int32_t margin;                // pixels of the maps before the picture
-  int32_t height, width;         // of the picture, multiples of the largest scale
-  int32_t channels;              // with kernel_colours at most MOST_PLANES of native/__init__.py
-  int32_t surfaces;              // 1, or 2 that share each pixel
-  const float *const *light;     // for each surface [channels, rows, columns]
-  const float *const *place;     // for each surface [rows, columns]: position on the blur axis
-  const float *const *weight;    // for each surface [rows, columns], or null: it covers its pixels fully
-  int32_t occlusion;             // 0: light and weights of all layers are added
-  int32_t backed;                // 1: there is light behind all surfaces, so the transmittance is computed, not the coverage
+  int32_t rows, columns;       // of the maps; multiples of the largest scale, as is the margin
+  int32_t margin;              // pixels of the maps before the picture
+  int32_t height, width;       // of the picture, multiples of the largest scale
+  int32_t channels;            // with kernel_colours at most MOST_PLANES of native/__init__.py
+  int32_t surfaces;            // 1, or 2 that share each pixel
+  const float *const *light;   // for each surface [channels, rows, columns]
+  const float *const *place;   // for each surface [rows, columns]: position on the blur axis
+  const float *const *weight;  // for each surface [rows, columns], or null: it covers its pixels fully
+  int32_t occlusion;           // 0: light and weights of all layers are added
+  int32_t backed;  // 1: there is light behind all surfaces, so the transmittance is computed, not the coverage
 
-  int32_t layers;                // as in torchdof_scene
+  int32_t layers;  // as in torchdof_scene
   const double *nodes;
   const int32_t *scales, *halves;
   int32_t kernel_colours;
@@ -149,13 +150,13 @@ typedef struct {
   const volatile int32_t *cancelled;
 } torchdof_layers;
 
-// Steps with a gradient. Without `gradient` they write `out`; else, given the gradient of `out`, they add to the gradients
-// of the inputs, which have the inputs' shapes, and write nothing else.
+// Steps with a gradient. Without `gradient` they write `out`; else, given the gradient of `out`, they add to the
+// gradients of the inputs, which have the inputs' shapes, and write nothing else.
 
 // out: [channels + kernel_colours, height, width]: light, and coverage or transmittance, or sum of weights. A surface
 // without weight has no gradient of the weight.
-TORCHDOF_API int32_t torchdof_blend(const torchdof_layers *layers, float *out, const float *gradient, float *const *of_light,
-                                    float *const *of_place, float *const *of_weight);
+TORCHDOF_API int32_t torchdof_blend(const torchdof_layers *layers, float *out, const float *gradient,
+                                    float *const *d_light, float *const *d_place, float *const *d_weight);
 
 // A level of the pyramid from which hidden surfaces are filled; see render/surfaces/disocclusion.py.
 typedef struct {
@@ -166,44 +167,48 @@ typedef struct {
   float slope, most;      // votes for each weight of the samples, and largest number of votes
 } torchdof_level;
 
-// Splits the mixed pixels of an image; see render/surfaces/matting.py. maps: light [channels, height, width], coc [height, width], and 0
-// for pixels that are left out [height, width] or null. out: own and other light, coc and weight of the other surface,
-// [2 channels + 2, height, width]. The first two maps have gradients.
-TORCHDOF_API int32_t torchdof_matte(const float *const *maps, int32_t channels, int32_t height, int32_t width, int32_t threads,
-                                    float *out, const float *gradient, float *const *of_maps);
+// Splits the mixed pixels of an image; see render/surfaces/matting.py. maps: light [channels, height, width], coc
+// [height, width], and 0 for pixels that are left out [height, width] or null. out: own and other light, coc and weight
+// of the other surface, [2 channels + 2, height, width]. The first two maps have gradients.
+TORCHDOF_API int32_t torchdof_matte(const float *const *maps, int32_t channels, int32_t height, int32_t width,
+                                    int32_t threads, float *out, const float *gradient, float *const *d_maps);
 
-// The finest level of that pyramid, [channels + 2, rows, columns], from the surfaces of an image. maps: light [channels, height,
-// width], coc [height, width]; the same of each pixel's other surface, and its weight; light above which a pixel is a
-// highlight; and 0 for pixels that are left out, or null. The first five maps have gradients. Without another surface and
-// a threshold, all null, it is the next level, from the light, coc and weight of a finer one.
-TORCHDOF_API int32_t torchdof_farthest(const float *const *maps, int32_t channels, int32_t height, int32_t width, int32_t rows,
-                                       int32_t columns, int32_t threads, float *out, const float *gradient, float *const *of_maps);
+// The finest level of that pyramid, [channels + 2, rows, columns], from the surfaces of an image. maps: light
+// [channels, height, width], coc [height, width]; the same of each pixel's other surface, and its weight; light above
+// which a pixel is a highlight; and 0 for pixels that are left out, or null. The first five maps have gradients.
+// Without another surface and a threshold, all null, it is the next level, from the light, coc and weight of a finer
+// one.
+TORCHDOF_API int32_t torchdof_farthest(const float *const *maps, int32_t channels, int32_t height, int32_t width,
+                                       int32_t rows, int32_t columns, int32_t threads, float *out,
+                                       const float *gradient, float *const *d_maps);
 
-// The surfaces behind pixels with coc [height, width], from levels fine to coarse. out: light, coc and votes, [channels + 2,
-// height, width].
+// The surfaces behind pixels with coc [height, width], from levels fine to coarse. out: light, coc and votes, [channels
+// + 2, height, width].
 //
 // If wanted [height, width] is not null, those behind all cells of 4 x 4 pixels that the levels cover. A cell without a
-// wanted pixel, one that is not 0, has no votes. out: light, coc and votes of the farthest surface, [channels + 2, rows,
-// columns]; with more than two levels, also those of the mean of all but the finest two.
-TORCHDOF_API int32_t torchdof_look_behind(const torchdof_level *levels, int32_t count, int32_t channels, const float *coc,
-                                          const float *wanted, int32_t height, int32_t width, int32_t threads, float *out, const float *gradient,
-                                          float *const *of_levels, float *of_coc);
+// wanted pixel, one that is not 0, has no votes. out: light, coc and votes of the farthest surface, [channels + 2,
+// rows, columns]; with more than two levels, also those of the mean of all but the finest two.
+TORCHDOF_API int32_t torchdof_look_behind(const torchdof_level *levels, int32_t count, int32_t channels,
+                                          const float *coc, const float *wanted, int32_t height, int32_t width,
+                                          int32_t threads, float *out, const float *gradient, float *const *d_levels,
+                                          float *d_coc);
 
-// Surfaces continued beyond the frame's border: light, position on the blur axis and weight of each [surfaces, channels + 2,
-// height + ends, width + ends]; see render/surfaces/border.py. maps: light of each surface [channels, height, width], coc of each, weight
-// of each, and light above which a pixel is a highlight, [height, width]. ends: pixels added at the left, right, top and bottom.
-// low, high: ends of the blur axis. image: the image's own surface, or -1: each one is an image. All maps but the last have
-// gradients.
-TORCHDOF_API int32_t torchdof_continued(const float *const *maps, int32_t surfaces, int32_t channels, int32_t height, int32_t width,
-                                        const int32_t *ends, float low, float high, int32_t image, int32_t threads, float *out,
-                                        const float *gradient, float *const *of_maps);
+// Surfaces continued beyond the frame's border: light, position on the blur axis and weight of each [surfaces, channels
+// + 2, height + ends, width + ends]; see render/surfaces/border.py. maps: light of each surface [channels, height,
+// width], coc of each, weight of each, and light above which a pixel is a highlight, [height, width]. ends: pixels
+// added at the left, right, top and bottom. low, high: ends of the blur axis. image: the image's own surface, or -1:
+// each one is an image. All maps but the last have gradients.
+TORCHDOF_API int32_t torchdof_continued(const float *const *maps, int32_t surfaces, int32_t channels, int32_t height,
+                                        int32_t width, const int32_t *ends, float low, float high, int32_t image,
+                                        int32_t threads, float *out, const float *gradient, float *const *d_maps);
 
 // Smallest and largest value; both NaN if any value is NaN.
 TORCHDOF_API int32_t torchdof_ends(const float *values, int64_t count, int32_t threads, float *low, float *high);
 
-// Version of this interface, for the caller to check first: sizes of its structures and, in the upper half,
-// _REVISION of native/__init__.py, which increases with every other change of this file.
+// Checksum of the text of this file that it was compiled with. The caller compares it with that of the file from which
+// it takes the structures and functions, before it calls any other function.
 TORCHDOF_API int64_t torchdof_interface(void);
 
-// Checksum of the constants of Python modules that it was compiled with; cmake/constants.py computes that of the sources.
+// Checksum of the constants of Python modules that it was compiled with; cmake/constants.py computes that of the
+// sources.
 TORCHDOF_API int64_t torchdof_constants(void);
