@@ -116,8 +116,11 @@ class DepthMap(Group):
             return options, f"{same}; is this the depth map? it was taken for metres (else --depth-kind)"
         if guess.kind == "z":
             unit, other = {
-                0.001: ("millimetres", ", with 0.0039 for KITTI's metres * 256, 0.0002 for metres * 5000"),
-                1 / 256: ("metres * 256, as KITTI's", ", with 0.001 for millimetres"),
+                0.001: (
+                    "millimetres",
+                    ", with 0.01 for centimetres, 0.0039 for KITTI's metres * 256, 0.0002 for * 5000",
+                ),
+                1 / 256: ("metres * 256, as KITTI's", ", with 0.01 for centimetres, 0.001 for millimetres"),
             }.get(guess.scale or 1.0, ("metres", ""))
             doubt = f", but {LIKE_RELATIVE}" if guess.scale is None and looks_relative(known) else ""
             return options, f"taken for {unit} (else --depth-kind, --depth-scale{other}){doubt}"

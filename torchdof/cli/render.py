@@ -54,7 +54,7 @@ class _Effects(Group):
 class _Files(Group):
     """Files and frames."""
 
-    transfer: Encoding | None = option("How IMAGE is encoded. Default: as a PNG states; integers srgb, floats linear.")
+    transfer: Encoding | None = option("How IMAGE is encoded. Default: as it states; integers srgb, floats linear.")
     out_transfer: Encoding | None = option("How OUT is encoded. Default: as IMAGE, else by type.")
     bits: Literal["8", "16", "half", "float"] | None = option("What OUT stores. Default: as IMAGE, where the type can.")
     layer: str | None = option("Layer or part of an EXR that is the image.")
