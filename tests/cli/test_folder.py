@@ -105,6 +105,25 @@ def test_resume_renders_what_is_missing_or_older_than_its_files_or_options(photo
     assert rendered("--blur 3%") == ["a.png", "b.png"]
 
 
+def test_masks_are_matched_by_name_and_one_that_is_missing_is_listed(photographs: Path, run: Run) -> None:
+    cover = np.zeros((16, 24), np.uint8)
+    cover[:, :12] = 255
+    Path("masks").mkdir()
+    np.save("masks/a_mask.npy", cover)
+    code, lines, errors = told(f"{RENDER} --matte masks --blur 10%")
+    assert code == 2 and lines.count("out/") == 1 and sorted(os.listdir("out")) == ["a.png"]
+    assert "photos/b.png: masks holds no mask of this name" in errors
+    run("render photos/a.png depths/a.npy -o one.png --matte masks/a_mask.npy --blur 10%")
+    run("render photos/a.png depths/a.npy -o without.png --blur 10%")
+    matted, one, without = (read_image(name).pixels for name in ("out/a.png", "one.png", "without.png"))
+    assert torch.equal(matted, one) and not torch.equal(matted, without)
+    np.save("masks/mask_b.npy", cover)
+    _, lines, _ = told(f"{RENDER} --matte masks --blur 10% --resume")
+    assert "1 of 2 pictures are there already" in lines and Path("out/b.png").is_file()
+    os.utime("masks/a_mask.npy")
+    assert told(f"{RENDER} --matte masks --blur 10% --resume --json")[1].count("camera") == 1
+
+
 def test_portraits_need_no_folder_of_maps(photographs: Path, run: Run) -> None:
     Path("phone").mkdir()
     Path("phone/IMG_1.HEIC").write_bytes(HEIC.read_bytes())
@@ -120,6 +139,7 @@ def test_portraits_need_no_folder_of_maps(photographs: Path, run: Run) -> None:
         ("render depths -o out", "holds no image that can be read"),
         (f"{RENDER} --sheet s.png", "--sheet is of one picture"),
         (f"{RENDER} --steady", "are for sequences"),
+        (f"{RENDER} --matte depths/a.npy", "--matte is the folder of their masks"),
         (f"{RENDER} --focus-m 1:2,3:4", "takes one distance"),
     ],
 )

@@ -135,9 +135,19 @@ def test_a_portrait_is_rendered_with_its_own_matte_unless_none_is_wanted(
     assert not torch.equal(own, none)
 
 
-def test_one_mask_is_not_for_many_pictures(files: None) -> None:
-    Path("photos").mkdir()
-    assert "--matte is of one picture" in render("photos -o out --matte mask.png", 2)
+def test_each_frame_has_its_own_mask_or_all_share_one(files: None) -> None:
+    options = "--focus-m 4 --aperture-radius-m 0.05 --fov-deg 40"
     for n in (1, 2):
-        Path("image.exr").with_name(f"shot.{n}.exr").write_bytes(Path("image.exr").read_bytes())
-    assert "--matte is of one picture" in render("shot.#.exr depth.npy -o out.#.exr --matte mask.png", 2)
+        Path(f"shot.{n}.exr").write_bytes(Path("image.exr").read_bytes())
+    Image.open("mask.png").save("mask.1.png")
+    Image.open("mask.png").transpose(Image.Transpose.FLIP_LEFT_RIGHT).save("mask.2.png")
+    render(f"shot.#.exr depth.npy -o own.#.exr {options} --matte mask.#.png")
+    render(f"shot.#.exr depth.npy -o same.#.exr {options} --matte mask.png")
+    render(f"image.exr depth.npy -o one.exr {options} --matte mask.png")
+    own_1, own_2, same_2, one = (read_image(f"{name}.exr").pixels for name in ("own.1", "own.2", "same.2", "one"))
+    assert torch.equal(own_1, one) and torch.equal(same_2, one) and not torch.equal(own_2, one)
+    Path("mask.2.png").unlink()
+    assert "mask.2.png" in render(f"shot.#.exr depth.npy -o own.#.exr {options} --matte mask.#.png", 2)
+    message = "mask.#.png: masks of frames are for a sequence"
+    assert message in render(f"image.exr depth.npy -o out.exr {options} --matte mask.#.png", 2)
+

@@ -192,16 +192,25 @@ class Renderer:
         self.table, self.device = command.blur_table(), _device(command.device)
         self.notices, self.is_assumed = Notices(command.strict), is_assumed
 
-    def read(self, image: Path | Picture, depth: Path | Tensor | None, place: tuple[int, int] | None = None) -> Frame:
-        """Reads a frame as :func:`read_frame`, with the transfer curve and layers of the options."""
+    def read(
+        self,
+        image: Path | Picture,
+        depth: Path | Tensor | None,
+        place: tuple[int, int] | None = None,
+        matte: Path | None = None,
+    ) -> Frame:
+        """Reads a frame as :func:`read_frame`, with the transfer curve and layers of the options.
+
+        ``matte`` is the file of this frame, if the option names a sequence or a folder.
+        """
         names = ("transfer", "layer", "keep_layers")
         encoding: Any = {name: getattr(self.command, name) for name in names}
         frame = read_frame(image, depth, self.command, place=place, **encoding)
-        return dataclasses.replace(frame, matte=self._matte(frame.picture))
+        return dataclasses.replace(frame, matte=self._matte(frame.picture, matte))
 
-    def _matte(self, picture: Picture) -> Tensor | None:
+    def _matte(self, picture: Picture, of_frame: Path | None) -> Tensor | None:
         """The coverage by a subject that the options name, or that the picture brings along."""
-        given: Any = self.command.matte
+        given: Any = of_frame or self.command.matte
         if given is None:
             return None if self.command.no_occlusion else picture.matte
         if isinstance(given, Tensor):

@@ -212,12 +212,12 @@ def named_table(name: str) -> "BlurTable":
     return getattr(BlurTable, name)() if name in ("disc", "gaussian") else BlurTable.load(name)
 
 
-def check_files(image: Path, depth: Path | None, *outputs: Path | None) -> None:
+def check_files(image: Path, depth: Path | None, *outputs: Path | None, matte: Path | None = None) -> None:
     """Refuse missing inputs, outputs that are inputs or the same file, and outputs of an unsupported type."""
     existing_image(image)
-    if depth is not None:
-        existing_map(depth)
-    inputs = map(os.path.realpath, filter(None, (image, depth)))
+    for path in filter(None, (depth, matte)):
+        existing_map(path)
+    inputs = map(os.path.realpath, filter(None, (image, depth, matte)))
     problems = dict.fromkeys(inputs, "is one of the inputs; write to another file")
     for out in filter(None, outputs):
         if problem := problems.get(os.path.realpath(out)):
