@@ -150,4 +150,3 @@ def test_each_frame_has_its_own_mask_or_all_share_one(files: None) -> None:
     assert "mask.2.png" in render(f"shot.#.exr depth.npy -o own.#.exr {options} --matte mask.#.png", 2)
     message = "mask.#.png: masks of frames are for a sequence"
     assert message in render(f"image.exr depth.npy -o out.exr {options} --matte mask.#.png", 2)
-
