@@ -37,9 +37,9 @@ class Picture(NamedTuple):
 def pictures_in(images: Path, depths: Path | None, out: Path, mattes: Path | None = None) -> list[Picture]:
     """The photographs of a folder, by name.
 
-    The depth of ``a.jpg`` is the map ``a``, ``a_depth`` or ``depth_a`` of any type in ``depths``, or ``a/depth`` (MoGe),
-    and its mask likewise ``a``, ``a_mask`` or ``a_rgba`` in ``mattes``. The result is ``a.jpg`` in ``out``;
-    types that cannot be written become JPEG.
+    The depth of ``a.jpg`` is the map ``a``, ``a_depth`` or ``depth_a`` of any type in ``depths``, or ``a/depth``, as
+    MoGe writes it, and its mask likewise ``a``, ``a_mask`` or ``a_rgba`` in ``mattes``. The result is ``a.jpg`` in
+    ``out``; types that cannot be written become JPEG.
     """
     found = [path for path in _files(images) if path.suffix.lower() in (*IMAGE_SUFFIXES, *OPTIONAL_SUFFIXES)]
     maps = {path: _map_of(path, depths) for path in found} if depths else dict[Path, Path | None]()
