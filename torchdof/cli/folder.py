@@ -1,5 +1,6 @@
 """A folder of photographs for ``torchdof render``: what belongs together, and rendering them all in one process."""
 
+import dataclasses
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -114,15 +115,17 @@ def _render_each(command: "Render", todo: Sequence[Picture], record: Record) -> 
     """Renders pictures in order; while one is rendered, the next is read. Gives each that failed, and why."""
     from .frame import Renderer
 
-    renderer = Renderer(command, is_still=True)
+    one_by_one = dataclasses.replace(command, matte=None) if command.has_matte_file else command
+    renderer = Renderer(one_by_one, is_still=True)
     renderer.notices = Notices(command.strict, each_message=True)
 
     def read(picture: Picture) -> "Frame":
-        if command.has_matte_file and picture.matte is None:
-            raise FileNotFoundError(f"{picture.image}: {command.matte} holds no mask of this name")
         check_files(*picture[:3], matte=picture.matte)
         check_writable(picture.out)
-        return renderer.read(picture.image, picture.depth, matte=picture.matte)
+        frame = renderer.read(picture.image, picture.depth, matte=picture.matte)
+        if command.has_matte_file and frame.matte is None:
+            raise FileNotFoundError(f"{picture.image}: {command.matte} holds no mask of this name")
+        return frame
 
     is_first = True
     with progress_bar(f"rendering {command.image.name}", len(todo)) as update, ThreadPoolExecutor(1) as pool:
@@ -140,7 +143,9 @@ def _render_each(command: "Render", todo: Sequence[Picture], record: Record) -> 
                 write()
             except (OSError, ValueError) as error:
                 message = str(error) if str(picture.image) in str(error) else f"{picture.image}: {error}"
-                if command.depth and picture.depth is None:
+                if command.depth and picture.depth is None and "no depth channel" in message:
                     message += f" ({command.depth} holds no map of this name)"
                 to_stderr(f"failed: {message}")
                 yield picture.image, message
+    for line, count in renderer.notices.repeated():
+        to_stderr(f"note: the same for {count} more: {line}")

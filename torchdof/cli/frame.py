@@ -216,7 +216,7 @@ class Renderer:
         if isinstance(given, Tensor):
             one_channel("matte", given)
             return matte_of_size(given.detach().cpu().float(), picture.pixels.shape[-2:])
-        if not self.command.has_matte_file:
+        if str(given) == "none":
             return None
         return read_matte(given, picture.pixels.shape[-2:], picture.window)
 
