@@ -200,8 +200,9 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
             return (images, self.label(input, depth, params)) if self.return_label else images
         finally:
             for drawn in (params, self._params):  # maps are inputs, not parameters that a call keeps
-                for name in maps if drawn is not None else ():
-                    drawn.pop(name, None)
+                if drawn is not None:
+                    for name in maps:
+                        drawn.pop(name, None)
 
     def _forward_dict(self, sample: Mapping[str, Any], params: Any, **kwargs: Any) -> dict[str, Any]:
         """Blur a sample that is a dict, as in torchvision's transforms."""
@@ -323,8 +324,8 @@ class DepthAugmentationSequential(AugmentationSequential):
 
     Args:
         *args: Augmentations; :class:`RandomDepthOfField` must be a direct member, not inside another container.
-        matte_mask: Index of the mask that is the coverage by a subject, in [0, 1]; 1 is the mask after the depth. None
-            means that there is none.
+        matte_mask: Index of the mask that is the coverage by a subject, in [0, 1]: 1 is the mask after the depth. None
+            blurs without a matte.
         **kwargs: As Kornia's; ``data_keys`` are ``"input"``, ``"mask"`` for the depth, and any others. With
             ``data_keys=None`` the input is a dict, in which the first key that begins with ``"mask"`` is the depth.
 

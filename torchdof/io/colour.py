@@ -118,7 +118,7 @@ def _profile_primaries(profile: Any) -> Chromaticities | None:
         columns = [np.array(struct.unpack_from(">3i", tags[name], 8)) / 65536 for name in (b"rXYZ", b"gXYZ", b"bXYZ")]
     except (KeyError, struct.error):
         return None
-    colours = [*columns, sum(columns)]
+    colours = [*columns, np.sum(columns, axis=0)]
     if min(colour.sum() for colour in colours) <= 0 or colours[3][1] <= 0:
         return None
     places = tuple(float(number) for colour in colours for number in colour[:2] / colour.sum())
