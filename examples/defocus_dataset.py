@@ -21,6 +21,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--images", type=Path, required=True, help="folder of all-in-focus images")
     parser.add_argument("--depths", type=Path, help="folder of their depth maps; default: the images' own Z channels")
+    parser.add_argument("--mattes", type=Path, help="folder of subjects' masks, which decide where hair ends")
     parser.add_argument("--out", type=Path, required=True, help="folder of the data set")
     parser.add_argument("--depth-kind", default="z", help="z, disparity, inverse, or relative, as estimators give it")
     parser.add_argument("--near-m", type=float, help="distance of the nearest value of relative depth")
@@ -55,7 +56,8 @@ def main() -> None:
         numbers = {"near_m": arguments.near_m, "far_m": arguments.far_m}
     depth = {"kind": arguments.depth_kind, "fill": arguments.fill_depth, **numbers}
     options = {name: getattr(arguments, name) for name in ("workers", "per_shard", "copies", "format", "seed")}
-    make_dataset(pairs_in(arguments.images, arguments.depths), arguments.out, blur, depth=depth, **options)
+    pairs = pairs_in(arguments.images, arguments.depths, arguments.mattes)
+    make_dataset(pairs, arguments.out, blur, depth=depth, **options)
 
 
 if __name__ == "__main__":

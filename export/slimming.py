@@ -28,6 +28,8 @@ __all__ = ["slim"]
 _WINDOW_DEFAULTS = {"pads": 0, "dilations": 1, "strides": 1}  # defaults of these attributes, for each axis
 
 _WHOLE_AXIS = 2**62  # ends of slices beyond it are those of an axis of any length
+_SINGLE = {"CumSum": (0,), "Max": (0, 1), "Min": (0, 1), "Range": (0, 1, 2), "Resize": (2,), "TopK": (0,)}
+"""Inputs that stay in single precision in files converted to half precision."""
 _MAX_EQUAL = 64  # constants with more equal numbers than this are stored as a shape and a value
 
 
@@ -69,6 +71,7 @@ def slim(model: onnx_ir.Model, straight: bool = False) -> onnx_ir.Model:
         passes.RemoveUnusedOpsetsPass(),
         passes.ClearMetadataAndDocStringPass(),
         *(() if straight else (_place_weights, passes.RemoveUnusedNodesPass(), _as_nodes)),
+        *((_separate,) if straight else ()),
         _drop_defaults,
         _shorten,
     )
@@ -168,6 +171,28 @@ def _as_nodes(model: onnx_ir.Model) -> None:
             value.replace_all_uses_with(constant)
         if tape.nodes:
             graph.insert_before(next(iter(graph)), list(tape.nodes))
+
+
+def _separate(model: onnx_ir.Model) -> None:
+    """Gives each operation that stays in single precision its own copy of a value that several of them read.
+
+    onnxruntime's converter to half precision casts their inputs, and names the cast after the value: two casts of one
+    value make a file that cannot be loaded.
+    """
+    readers: dict[onnx_ir.Value, onnx_ir.Node] = {}
+    for node in [node for node in model.graph if node.op_type in _SINGLE]:
+        for index in _SINGLE[node.op_type]:
+            value = node.inputs[index] if index < len(node.inputs) else None
+            if value is None or readers.setdefault(value, node) is node:
+                continue
+            if value.const_value is not None:
+                copy = initializer(model.graph, value.const_value.numpy(), f"{value.name}_{len(readers)}_{index}")
+                readers[copy] = node
+            else:
+                identity = onnx_ir.node("Identity", [value])
+                model.graph.insert_before(node, [identity])
+                copy = identity.outputs[0]
+            node.replace_input_with(index, copy)
 
 
 def _drop_defaults(model: onnx_ir.Model) -> None:

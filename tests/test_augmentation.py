@@ -249,3 +249,26 @@ def test_an_empty_batch_passes_as_through_kornias_own_steps(p: float) -> None:
     assert label["coc_px"].shape == depth.shape and label["focus_m"].shape == (0,)
     with pytest.raises(ValueError, match="depth must be"):
         aug(image, torch.rand(0, 1, 18, 23))
+
+
+def test_a_matte_goes_with_the_depth_and_decides_the_coverage() -> None:
+    image, depth = torch.rand(2, 3, 32, 48), torch.full((2, 1, 32, 48), 6.0)
+    depth[..., :20] = 1.0
+    matte = torch.zeros(2, 1, 32, 48)
+    matte[..., :22], matte[..., 22] = 1.0, 0.5
+    aug = RandomDepthOfField((6.0, 6.0), (1.0, 1.0), CAMERA, transfer="linear", p=1.0)
+    plain, matted = aug(image, depth), aug(image, depth, matte=matte)
+    camera = CAMERA.replace(focus_m=6.0, f_number=1.0)
+    assert not torch.equal(plain, matted) and "matte" not in aug._params
+    assert_close(matted, depth_of_field(image, depth, camera, matte=matte, check=False))
+    assert torch.equal(aug(image, depth, matte=matte[:, 0]), matted)
+    assert torch.equal(aug({"image": image, "depth": depth, "matte": matte})["image"], matted)
+    masks = ["input", "mask", "mask", "mask"]
+    turned = DepthAugmentationSequential(K.RandomHorizontalFlip(p=1.0), aug, data_keys=masks, matte_mask=2)
+    flipped, _, _, cover = turned(image.flip(-1), depth.flip(-1), torch.ones_like(depth), matte.flip(-1))
+    assert torch.equal(flipped, matted) and torch.equal(cover, matte)
+    few = DepthAugmentationSequential(aug, data_keys=["input", "mask"], matte_mask=1)
+    with pytest.raises(ValueError, match="matte_mask is 1, but there are 1 masks"):
+        few(image, depth)
+    with pytest.raises(ValueError, match="matte must"):
+        aug(image, depth, matte=matte[..., 1:])

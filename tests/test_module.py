@@ -213,6 +213,21 @@ def test_the_module_compiles_without_graph_breaks_and_equals_eager(backend: str,
 
 
 @TRACED
+def test_a_compiled_module_takes_a_matte() -> None:
+    torch.compiler.reset()
+    camera, image, _ = compiled_case()
+    depth, matte = torch.full((1, 1, 10, 14), 3.0), torch.zeros(1, 1, 10, 14)
+    depth[..., :6], matte[..., :7], matte[..., 7] = 1.5, 1.0, 0.5
+    dof = DepthOfField(camera, **COMPILED)
+    plan = Plan.static(COMPILED["max_coc_px"], COMPILED["tolerance"])
+    compiled = torch.compile(dof, backend="eager")
+    for cover in (matte, matte.flip(-1)):
+        eager = dof(image, depth, plan=plan, matte=cover)
+        assert_close(compiled(image, depth, matte=cover), eager, rtol=1e-5, atol=1e-6)
+        assert rms(eager, dof(image, depth, plan=plan)) > 1e-3
+
+
+@TRACED
 def test_a_plan_can_be_compiled_and_renders_without_rays() -> None:
     torch.compiler.reset()
     camera, image, depth = compiled_case()

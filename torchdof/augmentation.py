@@ -25,7 +25,7 @@ from .optics.blur_table import BlurTable
 from .optics.camera import Camera
 from .options import OptionArguments, Options, spells_options
 from .tensors import floating
-from .validation import choice, image_and_map, number, real_tensor, show
+from .validation import choice, image_and_map, number, real_tensor, show, whole
 
 __all__ = ["DepthAugmentationSequential", "RandomDepthOfField"]
 
@@ -43,7 +43,9 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
     cost nothing.
 
     The depth comes in one of three ways: as the second argument, as the last channel of an image of two or four
-    channels (which is returned with it, unchanged), or under the key ``"depth"`` of a dict.
+    channels (which is returned with it, unchanged), or under the key ``"depth"`` of a dict. The coverage by a subject,
+    in [0, 1], is the argument ``matte``, or the key ``"matte"``; it decides where hair ends, as in
+    :meth:`torchdof.DepthOfField.forward`, and needs occlusion.
 
     Where the depth is not > 0, for example in the corners after a rotation, pixels stay sharp, because ``check`` is
     False by default. A crop narrows the field of view, as a smaller ``sensor_width_mm`` does: ``camera`` must describe
@@ -165,17 +167,19 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         input: Any,
         depth: Tensor | None = None,
         params: dict[str, Tensor] | None = None,
+        matte: Tensor | None = None,
         **kwargs: Any,
     ) -> Any:
         """Blur images.
 
         Args:
             input: ``[B, C, H, W]``, B may be 0, or ``[C, H, W]``; without ``depth``, its last channel is the depth. Or
-                a dict with ``"image"`` (or ``"input"``, ``"img"``) and ``"depth"``, which is returned with the image
-                replaced.
+                a dict with ``"image"`` (or ``"input"``, ``"img"``), ``"depth"`` and perhaps ``"matte"``, which is
+                returned with the image replaced.
             depth: Metres, ``[B, 1, H, W]``, ``[B, H, W]`` or ``[1, 1, H, W]``; of one image ``[1, H, W]`` or
                 ``[H, W]``.
             params: Parameters of an earlier call, to repeat it; None draws new ones.
+            matte: Coverage by a subject in [0, 1], in a shape of ``depth``, or None.
             **kwargs: Arguments from Kornia's containers.
 
         Returns:
@@ -188,16 +192,17 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         if isinstance(input, Mapping):
             return self._forward_dict(input, params, **kwargs)
         shape = _batch_shape(input)
-        if depth is not None:
-            params = dict(self.forward_parameters(shape) if params is None else params)
-            params["depth"] = depth
+        maps = {name: value for name, value in (("depth", depth), ("matte", matte)) if value is not None}
+        if maps:
+            params = dict(self.forward_parameters(shape) if params is None else params) | maps
         try:
             images = super().forward(input, params, **kwargs)
             return (images, self.label(input, depth, params)) if self.return_label else images
         finally:
-            for drawn in (params, self._params):  # depth is an input, not a parameter that a call keeps
+            for drawn in (params, self._params):  # maps are inputs, not parameters that a call keeps
                 if drawn is not None:
-                    drawn.pop("depth", None)
+                    for name in maps:
+                        drawn.pop(name, None)
 
     def _forward_dict(self, sample: Mapping[str, Any], params: Any, **kwargs: Any) -> dict[str, Any]:
         """Blur a sample that is a dict, as in torchvision's transforms."""
@@ -205,7 +210,7 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         if key not in sample or "depth" not in sample:
             raise ValueError(f"a dict must have 'image' and 'depth', got the keys {', '.join(map(str, sample))}")
         image, depth = (_as_plain_tensor(sample[name]) for name in (key, "depth"))
-        blurred = self.forward(image, depth, params, **kwargs)
+        blurred = self.forward(image, depth, params, _as_plain_tensor(sample.get("matte")), **kwargs)
         blurred, label = blurred if self.return_label else (blurred, {})
         return {**sample, key: _as_type_of(sample[key], blurred.reshape(image.shape)), **label}
 
@@ -269,13 +274,15 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
     ) -> Tensor:
         """Blur the images ``[B, C, H, W]`` that ``params`` select."""
         image, depth, passed_on = _image_and_depth(input, params.get("depth"))
+        matte = None if "matte" not in params else _as_map("matte", params["matte"], image, "in [0, 1]")
         blurred = self._chosen(params, len(input))
         for index in params["table"][blurred].unique().tolist():
             items = blurred[params["table"][blurred] == index].to(input.device)
             options: Any = self.renderings[int(index)].arguments()
             lens: Any = {name: params[name].to(items.device)[items] for name in ("focus_m", "f_number")}
             light = self._light(image[items], flags["transfer"])
-            rendered = depth_of_field(light, depth[items], self._camera_of(items), **lens, **options)
+            covered = None if matte is None else matte[items]
+            rendered = depth_of_field(light, depth[items], self._camera_of(items), **lens, matte=covered, **options)
             if flags["transfer"] == "srgb":
                 rendered = encode(rendered, "srgb", has_alpha=False, straight=False)
             image = image.index_copy(0, items, rendered)
@@ -317,11 +324,13 @@ class DepthAugmentationSequential(AugmentationSequential):
 
     Args:
         *args: Augmentations; :class:`RandomDepthOfField` must be a direct member, not inside another container.
+        matte_mask: Index of the mask that is the coverage by a subject, in [0, 1]: 1 is the mask after the depth. None
+            blurs without a matte.
         **kwargs: As Kornia's; ``data_keys`` are ``"input"``, ``"mask"`` for the depth, and any others. With
             ``data_keys=None`` the input is a dict, in which the first key that begins with ``"mask"`` is the depth.
 
     Raises:
-        ValueError: When called, if there is no mask and a member needs the depth.
+        ValueError: If ``matte_mask`` is not from 1; when called, if a member needs a mask that is missing.
 
     Example:
         >>> from kornia.augmentation import RandomHorizontalFlip
@@ -334,9 +343,10 @@ class DepthAugmentationSequential(AugmentationSequential):
         (torch.Size([2, 3, 8, 12]), torch.Size([2, 1, 8, 12]), torch.Size([2, 1, 8, 12]))
     """
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
+    def __init__(self, *args: Any, matte_mask: int | None = None, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.transform_op = _DepthOps(self.data_keys)
+        self.transform_op.matte_mask = None if matte_mask is None else whole("matte_mask", matte_mask, 1, 1000)
 
     def forward(self, *args: Any, **kwargs: Any) -> Any:
         """As Kornia's, without rounding of the depth."""
@@ -362,7 +372,9 @@ def _in_single_precision(call: Callable[..., Any], args: tuple[Any, ...], kwargs
 
 
 class _DepthOps(AugmentationSequentialOps):
-    """Passes the depth to the steps that need it; Kornia's class passes each tensor separately."""
+    """Passes depth and matte to the steps that need them; Kornia's class passes each tensor separately."""
+
+    matte_mask: int | None = None
 
     def transform(
         self,
@@ -374,8 +386,13 @@ class _DepthOps(AugmentationSequentialOps):
     ) -> Any:
         keys = self.preproc_datakeys(data_keys)
         if isinstance(module, RandomDepthOfField) and DataKey.MASK in keys and isinstance(param.data, dict):
-            depth = arg[keys.index(DataKey.MASK)]
-            param = ParamItem(param.name, {**param.data, "depth": depth})
+            masks = [value for key, value in zip(keys, arg, strict=True) if key == DataKey.MASK]
+            maps = {"depth": masks[0]}
+            if self.matte_mask is not None:
+                if self.matte_mask >= len(masks):
+                    raise ValueError(f"matte_mask is {self.matte_mask}, but there are {len(masks)} masks, from 0 on")
+                maps["matte"] = masks[self.matte_mask]
+            param = ParamItem(param.name, {**param.data, **maps})
         return super().transform(*arg, module=module, param=param, extra_args=extra_args, data_keys=data_keys)
 
 
@@ -389,14 +406,19 @@ def _image_and_depth(input: Tensor, depth: Tensor | None) -> tuple[Tensor, Tenso
                 f"of DepthAugmentationSequential; got an image of {input.shape[1]} channels alone"
             )
         image, depth, passed_on = input[:, :-1], input[:, -1:], input[:, -1:]
-    real_tensor("depth", depth, "[B, 1, H, W] in metres")
-    if depth.ndim in (2, 3):
-        depth = depth.unsqueeze(-3) if depth.ndim == 2 or len(depth) == len(input) else depth
-        depth = depth if depth.ndim == 4 else depth[None]
+    return image, _as_map("depth", depth, image, "in metres"), passed_on
+
+
+def _as_map(name: str, values: Tensor, image: Tensor, unit: str) -> Tensor:
+    """A map of images ``[B, C, H, W]`` in any accepted shape as ``[B, 1, H, W]``."""
+    real_tensor(name, values, f"[B, 1, H, W] {unit}")
+    if values.ndim in (2, 3):
+        values = values.unsqueeze(-3) if values.ndim == 2 or len(values) == len(image) else values
+        values = values if values.ndim == 4 else values[None]
     # an empty batch passes, as through Kornia's own steps; its other axes are checked
-    checked_image, checked_depth = (t if len(t) else t.new_empty(1, *t.shape[1:]) for t in (image, depth))
-    image_and_map(checked_image, "depth", checked_depth, "in metres")
-    return image, depth.expand(len(input), -1, -1, -1), passed_on
+    checked_image, checked_map = (t if len(t) else t.new_empty(1, *t.shape[1:]) for t in (image, values))
+    image_and_map(checked_image, name, checked_map, unit)
+    return values.expand(len(image), -1, -1, -1)
 
 
 def _range(name: str, value: Any, largest: float) -> tuple[float, float]:

@@ -117,6 +117,7 @@ def parse_zemax(content: bytes) -> tuple[tuple[Surface, ...], int, str]:
     unit, name, catalogues = "MM", "", list[str]()
     for line in re.split(r"\r\n|\r|\n", _decoded(content)):  # splitlines also splits at bytes of other encodings
         word, *fields = line.split() or [""]
+        word = word.upper()
         if word == "SURF":
             records.append({})
         elif word == "MODE" and fields[:1] != ["SEQ"]:
@@ -126,7 +127,7 @@ def parse_zemax(content: bytes) -> tuple[tuple[Surface, ...], int, str]:
         elif word == "UNIT":
             unit = " ".join(fields[:1])
         elif word == "GCAT":
-            catalogues = fields
+            catalogues += fields
         elif word == "NAME":
             name = " ".join(fields)
         elif records:

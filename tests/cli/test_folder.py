@@ -75,6 +75,8 @@ def test_each_photograph_of_a_folder_is_rendered_with_its_own_guesses(photograph
     code, lines, notes = told(RENDER)
     assert code == 0 and [line.partition(":")[0] for line in lines.splitlines()] == ["out/a.png", "out/b.png"]
     assert notes.count("taken for metres") == 1 and notes.count("taken for relative depth") == 1
+    np.save("depths/b.npy", np.load("depths/a.npy"))
+    assert "\nnote: the same for 1 more: taken for metres" in told(RENDER)[2]
     for name in "ab":
         run(f"render photos/{name}.png depths/{name}.npy -o one.png")
         assert torch.equal(read_image(f"out/{name}.png").pixels, read_image("one.png").pixels)
@@ -84,7 +86,8 @@ def test_a_photograph_that_fails_is_listed_and_the_others_are_rendered(photograp
     Path("photos/0.png").write_bytes(b"text")
     write_image("photos/c.png", Picture(image))
     code, lines, errors = told(RENDER)
-    assert code == 2 and lines.count("out/") == 2 and sorted(os.listdir("out")) == ["a.png", "b.png"]
+    assert code == 2 and lines.count("out/") == 2, errors
+    assert sorted(os.listdir("out")) == ["a.png", "b.png"]
     listed = errors.partition("error: 2 of 4 pictures failed:\n")[2].splitlines()
     assert listed[0].startswith("  photos/0.png: cannot be read")
     assert (
@@ -105,6 +108,27 @@ def test_resume_renders_what_is_missing_or_older_than_its_files_or_options(photo
     assert rendered("--blur 3%") == ["a.png", "b.png"]
 
 
+def test_masks_are_matched_by_name_and_one_that_is_missing_is_listed(photographs: Path, run: Run) -> None:
+    cover = np.zeros((16, 24), np.uint8)
+    cover[:, :12] = 255
+    Path("masks").mkdir()
+    np.save("masks/a_mask.npy", cover)
+    Path("photos/own.heic").write_bytes(HEIC.read_bytes())
+    code, lines, errors = told(f"{RENDER} --matte masks --blur 10%")
+    assert code == 2 and lines.count("out/") == 2, errors
+    assert sorted(os.listdir("out")) == ["a.png", "own.jpg"]
+    assert errors.endswith("1 of 3 pictures failed:\n  photos/b.png: masks holds no mask of this name\n")
+    run("render photos/a.png depths/a.npy -o one.png --matte masks/a_mask.npy --blur 10%")
+    run("render photos/a.png depths/a.npy -o without.png --blur 10%")
+    matted, one, without = (read_image(name).pixels for name in ("out/a.png", "one.png", "without.png"))
+    assert torch.equal(matted, one) and not torch.equal(matted, without)
+    np.save("masks/mask_b.npy", cover)
+    _, lines, _ = told(f"{RENDER} --matte masks --blur 10% --resume")
+    assert "2 of 3 pictures are there already" in lines and Path("out/b.png").is_file()
+    os.utime("masks/a_mask.npy")
+    assert told(f"{RENDER} --matte masks --blur 10% --resume --json")[1].count("camera") == 1
+
+
 def test_portraits_need_no_folder_of_maps(photographs: Path, run: Run) -> None:
     Path("phone").mkdir()
     Path("phone/IMG_1.HEIC").write_bytes(HEIC.read_bytes())
@@ -120,6 +144,7 @@ def test_portraits_need_no_folder_of_maps(photographs: Path, run: Run) -> None:
         ("render depths -o out", "holds no image that can be read"),
         (f"{RENDER} --sheet s.png", "--sheet is of one picture"),
         (f"{RENDER} --steady", "are for sequences"),
+        (f"{RENDER} --matte depths/a.npy", "--matte is the folder of their masks"),
         (f"{RENDER} --focus-m 1:2,3:4", "takes one distance"),
     ],
 )

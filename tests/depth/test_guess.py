@@ -35,6 +35,7 @@ def ground(top: float, bottom: float) -> Tensor:
         (ground(-0.4, 3.0), False, Guess("relative")),
         (torch.cat([ground(-1.0, -1.0), ground(8.0, 1.5)], 3), False, Guess("z")),  # -1 was not measured
         (ground(6.0, 2.0).round(), False, Guess("z")),  # a few whole metres
+        (ground(4000.5, 600.25), False, MILLIMETRES),  # resampled
         ((ground(2.0, 0.2).round() * 100), True, Guess("relative", relative_kind="depth")),
         (torch.full((1, 1, 4, 4), 2.0), False, Guess("z")),
         (torch.tensor([2.0, 6.0]).repeat_interleave(32).repeat(1, 1, ROWS, 1), False, Guess("z")),  # equal downwards
@@ -59,6 +60,13 @@ def test_the_direction_of_a_portrait_is_that_of_the_person_and_is_not_sure() -> 
     assert guess_kind(ground(0.0, 1.0)).is_sure and guess_kind(ground(1.0, 0.0)).is_sure
     corridor = torch.maximum(*((torch.linspace(-1, 1, n).abs().unsqueeze(d)) for n, d in ((ROWS, 1), (COLUMNS, 0))))
     assert guess_kind(corridor[None, None]) == Guess("relative")
+
+
+def test_numbers_from_100_on_are_no_metres() -> None:
+    """MiDaS writes numbers in the thousands."""
+    assert guess_kind(100.5 + 2000 * portrait(0.8, 0.2)) == Guess("relative")
+    assert guess_kind(100.5 + 2000 * portrait(0.2, 0.8)) == MILLIMETRES
+    assert guess_kind(100.5 + 2000 * portrait(0.8, 0.2), metric=True) == Guess("z")
 
 
 def test_kitti_is_known_by_its_shape_or_by_its_empty_pixels() -> None:

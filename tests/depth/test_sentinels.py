@@ -30,9 +30,21 @@ def test_several_sentinels_are_found() -> None:
     assert values.view(-1)[2] == math.inf and int(values.isnan().sum()) == 3
 
 
+@pytest.mark.parametrize("marks", [(65535, 65534, 65533), (65000,), (60000, 61000), (1e10, 65533), (-1, -2)])
+@pytest.mark.parametrize("is_whole", [True, False])
+def test_neighbouring_sentinels_of_16_bits_and_negative_ones_are_found(marks: tuple[int, ...], is_whole: bool) -> None:
+    given = MM + (0.0 if is_whole else 0.5)
+    given.view(-1)[: len(marks)] = torch.tensor(marks, dtype=torch.float32)
+    values, remark = without_sentinels(given)
+    assert int(values.isnan().sum()) == len(marks) and remark.count("1 px of") == len(marks)
+    assert guess_kind(values) == Guess("z", 0.001, 0.0)
+
+
 @pytest.mark.parametrize(
     "values",
     [
+        torch.cat([torch.linspace(-2.0, 40.0, 43), torch.full((3029,), 5.0)]),
+        torch.cat([torch.linspace(-9.0, 40.0, 99), torch.full((2973,), 5.0)]),
         torch.linspace(0, 65535, 3072).round(),
         torch.linspace(0, 255, 3072).round(),
         torch.linspace(-3.0, 4.0, 3072),

@@ -281,3 +281,29 @@ def test_pairs_are_found_by_their_names(pairs: list[Pair], tmp_path: Path) -> No
     (tmp_path / "images" / "4.webp").touch()
     with pytest.raises(ValueError, match="4.png: there is 4.webp of the same name; keep one of them"):
         pairs_in(tmp_path / "images")
+
+
+def test_a_mask_decides_the_coverage_in_a_shard(tmp_path: Path) -> None:
+    random = torch.Generator().manual_seed(0)
+    write_image(tmp_path / "images" / "a.png", Picture(torch.rand(1, 3, 32, 48, generator=random)))
+    depth, cover = np.full((32, 48), 6.0, np.float32), np.zeros((32, 48), np.float32)
+    depth[:, :20], cover[:, :22], cover[:, 22] = 1.0, 1.0, 0.5
+    for folder, values in (("depths", depth), ("masks", cover)):
+        (tmp_path / folder).mkdir()
+        np.save(tmp_path / folder / "a.npy", values)
+    folders = [tmp_path / name for name in ("images", "depths", "masks")]
+    [pair] = pairs_in(*folders)
+    camera = Camera(focus_m=6.0, f_number=1.0, sensor_width_mm=4.0)
+    blur = RandomDepthOfField((6.0, 6.0), (1.0, 1.0), camera, p=1.0)
+    (tmp_path / "out").mkdir()
+    RenderShards(tmp_path / "out", blur, picture=".exr")(batch(shard_rows([pair])))
+    for name, content in members(tmp_path / "out" / "shard-000000.tar").items():
+        (tmp_path / name).write_bytes(content)
+    blurred, sharp = (read_image(tmp_path / f"00000000.{name}.exr").pixels for name in ("blurred", "sharp"))
+    metres, matte = (torch.from_numpy(values)[None, None] for values in (depth, cover))
+    expected = depth_of_field(sharp, metres, camera, matte=matte)
+    torch.testing.assert_close(blurred, expected, rtol=2e-3, atol=2e-3)  # half precision
+    assert float((expected - depth_of_field(sharp, metres, camera)).abs().max()) > 0.02
+    (tmp_path / "masks" / "a.npy").unlink()
+    with pytest.raises(ValueError, match=r"needs a mask a\.\* in .*masks, found none"):
+        pairs_in(*folders)

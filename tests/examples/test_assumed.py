@@ -62,6 +62,12 @@ def maps() -> dict[str, np.ndarray]:
         maps[f"{marked} with sentinels"][100:120, 5:9] = value
     maps["whole floats with two sentinels"] = maps["whole floats"].copy()
     maps["whole floats with two sentinels"].flat[:90] = np.repeat([1e10, -1.0, 3e12], 30)
+    maps["whole floats with more sentinels"] = maps["whole floats"].copy()
+    maps["whole floats with more sentinels"].flat[:90] = np.repeat([1e10, -1.0, -2.0], 30)
+    maps["words with a block of sentinels"] = maps["millimetres 2"].copy()
+    maps["words with a block of sentinels"].flat[:90] = np.repeat([65535, 65534, 65001], 30)
+    maps["millimetres as floats"] = 1000.5 * maps["metres 1"]
+    maps["thousands"] = 100.5 + 2000 * maps["person nearer"]
     maps["sky"] = np.where(person(1) > 0.5, 2.0, np.inf)
     maps["sky"][0, 0] = 9.0
     return maps

@@ -8,6 +8,7 @@ import onnx
 import onnx.shape_inference
 import pytest
 import torch
+from onnxruntime.transformers.float16 import convert_float_to_float16
 
 import torchdof
 from tests.exported import CAMERA
@@ -55,6 +56,20 @@ def test_every_case_agrees_and_a_highlight_is_the_only_difference_from_tiles(who
     assert (straight - tiles).abs().max() > 0.1
     near = (straight - tiles).abs().amax(1) > 1e-3
     assert not near[:, :40].any() and not near[:, :, :70].any()
+
+
+def test_the_converter_of_onnxruntime_makes_a_file_in_half_precision(whole: Any, tmp_path: Path) -> None:
+    half = convert_float_to_float16(onnx.load(whole.path), keep_io_types=True)
+    onnx.save(half, tmp_path / "half.onnx")
+    tensors = {name for node in half.graph.node for name in (*node.input, *node.output)}
+    assert len(tensors) > 100 and sum(t.data_type == onnx.TensorProto.FLOAT16 for t in half.graph.initializer) > 3
+    generator = torch.Generator().manual_seed(0)
+    image, depth = torch.rand(1, 3, 270, 480, generator=generator), torch.full((1, 1, 270, 480), 9.0)
+    depth[..., 80:160, 120:300] = 1.0
+    given = {"image": image, "depth": depth, "focus_m": torch.tensor([2.0]), "f_number": torch.tensor([0.4])}
+    feeds = {name: value.numpy() for name, value in given.items()}
+    single, rounded = (session(path).run(None, feeds)[0] for path in (whole.path, tmp_path / "half.onnx"))
+    assert abs(single - image.numpy()).max() > 0.1 and 0 < abs(single - rounded).max() < 4e-3
 
 
 def test_a_file_can_have_one_size_and_one_channel(tmp_path: Path) -> None:

@@ -182,6 +182,77 @@ def test_a_png_is_decoded_as_it_states_and_a_copy_states_the_same(
     assert transfer in ("pq", "hlg") or read_image(tmp_path / "c.jpg").pixels.mean() == pytest.approx(light, rel=0.02)
 
 
+ENCODED = np.linspace(0.0, 1.0, 1024)
+ROMM = struct.pack(">HH5i", 3, 0, *(round(65536 * p) for p in (1.8, 1, 0, 1 / 16, 1 / 32)))
+BT709 = struct.pack(">HH7i", 4, 0, *(round(65536 * p) for p in (1 / 0.45, 0.9095, 0.0905, 1 / 4.5, 0.081, 0, 0)))
+SRGB = struct.pack(">HH5i", 3, 0, *(round(65536 * p) for p in (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)))
+
+
+def table(light: np.ndarray) -> bytes:
+    return b"curv" + bytes(4) + len(light).to_bytes(4, "big") + (65535 * light).round().astype(">u2").tobytes()
+
+
+@pytest.mark.parametrize(
+    ("curve", "transfer"),
+    [
+        (table(np.array([0.0, 1.0])), "linear"),
+        (table(ENCODED), "linear"),
+        (table(ENCODED**1.8), "gamma 1.8"),
+        (table(ENCODED**2.2), None),
+        (b"para" + bytes(4) + ROMM, "gamma 1.8"),
+        (b"para" + bytes(4) + struct.pack(">HH3i", 1, 0, 2 * 65536, 65536, 0), "gamma 2"),
+        (b"para" + bytes(4) + BT709, "gamma 1.9445"),  # with the same light at a half
+        (b"para" + bytes(4) + SRGB, None),
+        (b"para" + bytes(4) + b"\0\3" + bytes(9), None),  # cut short
+    ],
+)
+def test_the_curve_of_a_profile_is_its_exponent_at_a_half(curve: bytes, transfer: str | None) -> None:
+    assert stated_transfer({"ICCProfile": profile(curve)}) == transfer
+
+
+@pytest.mark.parametrize(
+    ("suffix", "sample"), [(".tif", "uint16"), (".tif", "uint8"), (".jpg", "uint8"), (".webp", "uint8")]
+)
+@pytest.mark.parametrize("gamma", [1.0, 1.8])
+def test_the_profile_of_any_file_of_integers_is_decoded_and_kept(
+    tmp_path: Path, suffix: str, sample: str, gamma: float
+) -> None:
+    content = profile(b"para" + bytes(8) + round(gamma * 65536).to_bytes(4, "big"))
+    spec = spec_with(np.zeros((8, 8, 3)), sample)
+    spec.attribute("ICCProfile", f"uint8[{len(content)}]", np.frombuffer(content, np.uint8))
+    store_parts(tmp_path / f"a{suffix}", [(spec, np.full((8, 8, 3), 0.5, np.float32))])
+    picture = read_image(tmp_path / f"a{suffix}")
+    assert float(picture.pixels.mean()) == pytest.approx(0.5**gamma, abs=0.01)
+    for name in (f"b{suffix}", "b.exr"):
+        write_image(tmp_path / name, picture)
+        copy = read_image(tmp_path / name)
+        torch.testing.assert_close(copy.pixels, picture.pixels, rtol=0, atol=0.01)
+        assert ("ICCProfile" in copy.metadata) == (name != "b.exr")
+
+
+def test_the_primaries_of_a_profile_are_those_of_an_exr_and_converted_for_a_pfm(tmp_path: Path) -> None:
+    """Display P3, whose red is outside of sRGB, and sRGB, by their columns under D50."""
+    p3 = [(0.51512, 0.2412, -0.00105), (0.29198, 0.69225, 0.04189), (0.1571, 0.06657, 0.78407)]
+    srgb = [(0.43607, 0.22249, 0.01392), (0.38515, 0.71687, 0.09708), (0.14307, 0.06061, 0.7141)]
+    for columns, red in ((p3, (1.2249, -0.0421, -0.0196)), (srgb, (1.0, 0.0, 0.0))):
+        content = bytes(128) + struct.pack(">I", 3)
+        for k, name in enumerate((b"rXYZ", b"gXYZ", b"bXYZ")):
+            content += name + struct.pack(">II", 168 + 20 * k, 20)
+        content += b"".join(b"XYZ " + bytes(4) + struct.pack(">3i", *(round(65536 * v) for v in c)) for c in columns)
+        spec = spec_with(np.zeros((8, 8, 3)), "uint8")
+        spec.attribute("ICCProfile", f"uint8[{len(content)}]", np.frombuffer(content, np.uint8))
+        store_parts(tmp_path / "a.tif", [(spec, np.full((8, 8, 3), [1, 0, 0], np.float32))])
+        picture = read_image(tmp_path / "a.tif")
+        write_image(tmp_path / "b.tif", picture)
+        assert torch.equal(read_image(tmp_path / "b.tif").pixels, picture.pixels)
+        write_image(tmp_path / "b.exr", picture)
+        assert (stated_primaries(read_image(tmp_path / "b.exr").metadata) is None) == (columns is srgb)
+        for source in (picture, read_image(tmp_path / "b.exr")):
+            write_image(tmp_path / "b.pfm", source)
+            converted = read_image(tmp_path / "b.pfm").pixels[0, :, 0, 0]
+            torch.testing.assert_close(converted, torch.tensor(red), rtol=0, atol=2e-3)
+
+
 def test_a_linear_profile_is_decoded_and_an_unknown_encoding_refused(tmp_path: Path) -> None:
     assert stated_transfer({"ICCProfile": profile(b"curv" + bytes(8))}) == "linear"
     gamma = profile(b"para" + bytes(8) + round(1.8 * 65536).to_bytes(4, "big"))
@@ -399,7 +470,11 @@ COLOUR = dict.fromkeys("RGB", 0.5)
          "rgba_right", 8.0),
         ([named("rgba.left", of_values(**COLOUR)), named("z.right", of_values(Z=2)), named("z.left", of_values(Z=8))],
          None, 8.0),
-        ([named("image left", of_values(**COLOUR)), named("depth right", of_values(Z=2))], None, "of the other eye"),
+        ([named("image left", of_values(**COLOUR)), named("depth right", of_values(Z=2))], None, "of another view"),
+        ([of_values(L__R=1, L__G=1, L__B=1, R__Z=2)], "L", "of another view: R.Z"),
+        ([of_values(cam1__R=1, cam1__G=1, cam1__B=1, cam2__Z=2)], None, "of another view: cam2.Z"),
+        ([of_values(**COLOUR, Z=2, right__R=1, right__G=1, right__B=1)], "right", "of another view: Z"),
+        ([named("beauty", of_values(**COLOUR)), named("tech", of_values(Z=2))], None, 2.0),
         ([named("rgb", of_values(**COLOUR)), named("one", of_values(Z=2)), named("two", of_values(Z=8))], None,
          "belongs to the image: one.Z, two.Z"),
     ],
@@ -425,6 +500,14 @@ def test_a_depth_channel_is_chosen_by_the_name_of_its_part(tmp_path: Path, chann
         read_values(tmp_path / "x.exr", "Z")
     with pytest.raises(ValueError, match="no channel 'depth'; it has Z, Z in the parts depth_left, depth_right"):
         read_values(tmp_path / "x.exr", "depth")
+
+
+@pytest.mark.parametrize("channels", [{"X": 1, "Y": 1, "Z": 8}, {"V.Mist.Z": 0.7}])
+def test_a_coordinate_and_mist_are_no_depth(tmp_path: Path, channels: dict[str, float]) -> None:
+    store_parts(tmp_path / "x.exr", [of_values(**COLOUR), named("other", of_values(**channels))])
+    assert read_image(tmp_path / "x.exr").depth is None
+    with pytest.raises(ValueError, match="which of the channels R, G, B, .* is depth"):
+        read_values(tmp_path / "x.exr")
 
 
 # Data windows
@@ -578,7 +661,13 @@ def test_numbers_like_random_bytes_are_refused_and_sentinels_are_not(tmp_path: P
     for data in (depth.tobytes()[1:] + b"\0", depth.astype(">f4").tobytes(), noise):
         (tmp_path / "x.pfm").write_bytes(b"Pf\n80 60\n-1\n" + data)
         np.save(tmp_path / "x.npy", np.frombuffer(data, "<f4").reshape(60, 80))
-        for name in ("x.pfm", "x.npy"):
+        store(tmp_path / "x.exr", np.load(tmp_path / "x.npy"), "float", ("Z",))
+        store(tmp_path / "x.tif", np.load(tmp_path / "x.npy"), "float")
+        assert "as random bytes have" in read_image(store_parts(tmp_path / "rgbz.exr", [
+            (spec_with(np.zeros((60, 80, 3)), "float", RGB), np.zeros((60, 80, 3), np.float32)),
+            named("z", (spec_with(np.zeros((60, 80, 1)), "float", ("Z",)), np.load(tmp_path / "x.npy")[..., None])),
+        ])).depth_problem  # fmt: skip
+        for name in ("x.pfm", "x.npy", "x.exr", "x.tif"):
             with pytest.raises(ValueError, match="as random bytes have: its bytes are in another order"):
                 read_values(tmp_path / name)
     depth[20:], depth[:20:2], depth[1] = 1e30, 0.0, np.inf
@@ -637,6 +726,12 @@ def test_primaries_of_a_png_are_converted_unless_it_is_srgb(tmp_path: Path) -> N
     srgb = struct.pack(">I", 1) + body + struct.pack(">I", zlib.crc32(body))
     path.write_bytes(plain[:33] + chunk + srgb + plain[33:])
     assert stated_primaries(read_image(path).metadata) is None
+
+
+def test_a_float_map_of_one_channel_may_have_holes(tmp_path: Path) -> None:
+    values = np.array([[2.0, np.nan], [3.0, 4.0]], np.float32)
+    path = store(tmp_path / "x.tif", values, "float")
+    assert np.array_equal(read_values(path)[0, 0].numpy(), values, equal_nan=True)
 
 
 def test_a_pfm_of_half_floats_is_named(tmp_path: Path) -> None:

@@ -4,12 +4,14 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 import torch
 from click.testing import CliRunner
 from PIL import Image
 
 import torchdof
+from tests.files import store_parts
 from tests.io.test_portraits import HEIC
 from tests.refused import refuses
 from torchdof.cli.main import app
@@ -52,6 +54,17 @@ def test_labels_of_0_and_1_are_coverage_too(name: str, kind: type, tmp_path: Pat
 def test_a_smaller_mask_is_resampled_to_the_photograph(tmp_path: Path) -> None:
     mask = read_matte(stored(tmp_path / "m.png", np.full((4, 6), 255, np.uint8)), (8, 12))
     assert torch.equal(mask, torch.ones(1, 1, 8, 12))
+
+
+def test_a_mask_of_another_data_window_is_placed(tmp_path: Path) -> None:
+    """The subject is in columns 3 to 5 of a frame of 12; the photograph shows columns 2 to 7."""
+    spec = oiio.ImageSpec(4, 4, 1, "float")
+    spec.x, spec.full_width = 3, 12
+    store_parts(tmp_path / "m.exr", [(spec, np.repeat([[1, 1, 1, 0]], 4, 0).astype(np.float32)[..., None])])
+    frame = read_matte(tmp_path / "m.exr", (4, 12), (0, 0, 0, 0, 12, 4))
+    part = read_matte(tmp_path / "m.exr", (4, 6), (2, 0, 0, 0, 12, 4))
+    assert frame[0, 0, 0].tolist() == [0, 0, 0, 1, 1, 1, 0, 0, 0, 0, 0, 0]
+    assert torch.equal(part, frame[..., 2:8])
 
 
 MASK = torch.zeros(1, 1, 4, 6)
@@ -122,9 +135,18 @@ def test_a_portrait_is_rendered_with_its_own_matte_unless_none_is_wanted(
     assert not torch.equal(own, none)
 
 
-def test_one_mask_is_not_for_many_pictures(files: None) -> None:
-    Path("photos").mkdir()
-    assert "--matte is of one picture" in render("photos -o out --matte mask.png", 2)
+def test_each_frame_has_its_own_mask_or_all_share_one(files: None) -> None:
+    options = "--focus-m 4 --aperture-radius-m 0.05 --fov-deg 40"
     for n in (1, 2):
-        Path("image.exr").with_name(f"shot.{n}.exr").write_bytes(Path("image.exr").read_bytes())
-    assert "--matte is of one picture" in render("shot.#.exr depth.npy -o out.#.exr --matte mask.png", 2)
+        Path(f"shot.{n}.exr").write_bytes(Path("image.exr").read_bytes())
+    Image.open("mask.png").save("mask.1.png")
+    Image.open("mask.png").transpose(Image.Transpose.FLIP_LEFT_RIGHT).save("mask.2.png")
+    render(f"shot.#.exr depth.npy -o own.#.exr {options} --matte mask.#.png")
+    render(f"shot.#.exr depth.npy -o same.#.exr {options} --matte mask.png")
+    render(f"image.exr depth.npy -o one.exr {options} --matte mask.png")
+    own_1, own_2, same_2, one = (read_image(f"{name}.exr").pixels for name in ("own.1", "own.2", "same.2", "one"))
+    assert torch.equal(own_1, one) and torch.equal(same_2, one) and not torch.equal(own_2, one)
+    Path("mask.2.png").unlink()
+    assert "mask.2.png" in render(f"shot.#.exr depth.npy -o own.#.exr {options} --matte mask.#.png", 2)
+    message = "mask.#.png: masks of frames are for a sequence"
+    assert message in render(f"image.exr depth.npy -o out.exr {options} --matte mask.#.png", 2)

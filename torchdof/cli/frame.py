@@ -21,7 +21,7 @@ from ..depth.sentinels import without_sentinels
 from ..io.colour import stated_primaries
 from ..io.estimates import Estimate, estimate_of
 from ..io.highlights import expand_highlights
-from ..io.images import Picture, read_image, read_map, write_image
+from ..io.images import Picture, can_state_transfer, keeps_profile, read_image, read_map, write_image
 from ..io.matte import matte_of_size, read_matte
 from ..io.sheet import shrunk, write_sheet
 from ..module import blur_by_coc
@@ -192,22 +192,33 @@ class Renderer:
         self.table, self.device = command.blur_table(), _device(command.device)
         self.notices, self.is_assumed = Notices(command.strict), is_assumed
 
-    def read(self, image: Path | Picture, depth: Path | Tensor | None, place: tuple[int, int] | None = None) -> Frame:
-        """Reads a frame as :func:`read_frame`, with the transfer curve and layers of the options."""
+    def read(
+        self,
+        image: Path | Picture,
+        depth: Path | Tensor | None,
+        place: tuple[int, int] | None = None,
+        matte: Path | None = None,
+    ) -> Frame:
+        """Reads a frame as :func:`read_frame`, with the transfer curve and layers of the options.
+
+        ``matte`` is the file of this frame, if the option names a sequence or a folder.
+        """
         names = ("transfer", "layer", "keep_layers")
         encoding: Any = {name: getattr(self.command, name) for name in names}
         frame = read_frame(image, depth, self.command, place=place, **encoding)
-        return dataclasses.replace(frame, matte=self._matte(frame.picture))
+        return dataclasses.replace(frame, matte=self._matte(frame.picture, matte))
 
-    def _matte(self, picture: Picture) -> Tensor | None:
+    def _matte(self, picture: Picture, of_frame: Path | None) -> Tensor | None:
         """The coverage by a subject that the options name, or that the picture brings along."""
-        given: Any = self.command.matte
+        given: Any = of_frame or self.command.matte
         if given is None:
             return None if self.command.no_occlusion else picture.matte
         if isinstance(given, Tensor):
             one_channel("matte", given)
             return matte_of_size(given.detach().cpu().float(), picture.pixels.shape[-2:])
-        return read_matte(given, picture.pixels.shape[-2:]) if self.command.has_matte_file else None
+        if str(given) == "none":
+            return None
+        return read_matte(given, picture.pixels.shape[-2:], picture.window)
 
     def render(self, frame: Frame, out: Path, number: int) -> Callable[[], None]:
         """Renders a frame of a number; returns the function that writes it to ``out``."""
@@ -271,10 +282,12 @@ class Renderer:
             layers = ", ".join(frame.picture.other_layers)
             note("layers", f"{out}: is without the other layers of the image: {layers} (--keep-layers)")
         if picture.is_stated:
-            kept = picture.transfer if suffix == ".png" and command.out_transfer is None else "another encoding"
+            is_kept = can_state_transfer(picture, suffix) and command.out_transfer is None
+            kept = picture.transfer if is_kept else "another encoding"
             stated = f"{command.image}: states that it is encoded as {picture.transfer}, and is decoded so"
             note("transfer", f"{stated} (else --transfer); {out} has {kept}")
-        if stated_primaries(picture.metadata) is not None:
+        has_profile = keeps_profile(picture, suffix) and command.out_transfer is None
+        if stated_primaries(picture.metadata) is not None and not has_profile:
             is_kept = suffix == ".exr" or (suffix == ".png" and "CICP" in picture.metadata)
             kept = "keeps the primaries of the image" if is_kept else "has the primaries of sRGB, converted"
             note("primaries", f"{out}: {kept}; the image states others than those of sRGB")

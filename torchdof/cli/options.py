@@ -116,8 +116,11 @@ class DepthMap(Group):
             return options, f"{same}; is this the depth map? it was taken for metres (else --depth-kind)"
         if guess.kind == "z":
             unit, other = {
-                0.001: ("millimetres", ", with 0.0039 for KITTI's metres * 256, 0.0002 for metres * 5000"),
-                1 / 256: ("metres * 256, as KITTI's", ", with 0.001 for millimetres"),
+                0.001: (
+                    "millimetres",
+                    ", with 0.01 for centimetres, 0.0039 for KITTI's metres * 256, 0.0002 for * 5000",
+                ),
+                1 / 256: ("metres * 256, as KITTI's", ", with 0.01 for centimetres, 0.001 for millimetres"),
             }.get(guess.scale or 1.0, ("metres", ""))
             doubt = f", but {LIKE_RELATIVE}" if guess.scale is None and looks_relative(known) else ""
             return options, f"taken for {unit} (else --depth-kind, --depth-scale{other}){doubt}"
@@ -209,12 +212,12 @@ def named_table(name: str) -> "BlurTable":
     return getattr(BlurTable, name)() if name in ("disc", "gaussian") else BlurTable.load(name)
 
 
-def check_files(image: Path, depth: Path | None, *outputs: Path | None) -> None:
+def check_files(image: Path, depth: Path | None, *outputs: Path | None, matte: Path | None = None) -> None:
     """Refuse missing inputs, outputs that are inputs or the same file, and outputs of an unsupported type."""
     existing_image(image)
-    if depth is not None:
-        existing_map(depth)
-    inputs = map(os.path.realpath, filter(None, (image, depth)))
+    for path in filter(None, (depth, matte)):
+        existing_map(path)
+    inputs = map(os.path.realpath, filter(None, (image, depth, matte)))
     problems = dict.fromkeys(inputs, "is one of the inputs; write to another file")
     for out in filter(None, outputs):
         if problem := problems.get(os.path.realpath(out)):

@@ -53,7 +53,7 @@ class Notices:
 
     def __init__(self, strict: bool = False, each_message: bool = False, is_printed: bool = True) -> None:
         self._strict, self._each_message, self._is_printed = strict, each_message, is_printed
-        self._kinds, self.lines = set[str](), list[str]()  # kinds that were noted, and the lines
+        self._kinds, self.lines = dict[str, int](), list[str]()  # how often each kind came, and the lines
 
     def note(self, kind: str, line: str, word: str = "note") -> None:
         """Prints a note: an assumption, or advice, with the options that change it."""
@@ -62,7 +62,11 @@ class Notices:
             self.lines.append(f"{word}: {line}")
             if self._is_printed:
                 to_stderr(self.lines[-1])
-        self._kinds.add(kind)
+        self._kinds[kind] = self._kinds.get(kind, 0) + 1
+
+    def repeated(self) -> list[tuple[str, int]]:
+        """With ``each_message``, the texts that came again, and how often."""
+        return [(text, count - 1) for text, count in self._kinds.items() if count > 1]
 
     def warn(self, source: str | os.PathLike[str], mistakes: "Iterable[Mistake]") -> None:
         """Warns of likely mistakes in a file."""

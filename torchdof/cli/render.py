@@ -43,9 +43,9 @@ class _Effects(Group):
         type=click.FloatRange(min=0),
     )
     matte: Path | None = option(
-        "A subject's mask, in which white is the subject: decides where hair and other soft edges end. Default: that "
-        "of a phone's portrait; none leaves it out.",
-        metavar="FILE|none",
+        "A subject's mask, in which white is the subject: decides where hair and other soft edges end. One for all "
+        "frames, mask.####.png, or a folder. Default: that of a phone's portrait; none leaves it out.",
+        metavar="MASK|none",
     )
     show_focus: bool = option("Don't blur: tint the grey image: near orange, in focus green, far blue.", False)
     device: str = option("auto, cpu, cuda, cuda:1, ...", "auto")
@@ -54,7 +54,7 @@ class _Effects(Group):
 class _Files(Group):
     """Files and frames."""
 
-    transfer: Encoding | None = option("How IMAGE is encoded. Default: as a PNG states; integers srgb, floats linear.")
+    transfer: Encoding | None = option("How IMAGE is encoded. Default: as it states; integers srgb, floats linear.")
     out_transfer: Encoding | None = option("How OUT is encoded. Default: as IMAGE, else by type.")
     bits: Literal["8", "16", "half", "float"] | None = option("What OUT stores. Default: as IMAGE, where the type can.")
     layer: str | None = option("Layer or part of an EXR that is the image.")
@@ -111,8 +111,8 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
         return self.matte is not None and str(self.matte) != "none"
 
     def files(self) -> list[Path]:
-        """The files besides image and depth."""
-        return super().files() + [path for path in [self.matte] if path and self.has_matte_file]
+        """The files besides image and depth that all frames share."""
+        return super().files() + [path for path in [self.matte] if path and path.is_file()]
 
     def run(self) -> None:
         """Renders one image, the frames of a sequence, a focus pull in a still image, or a folder."""
@@ -126,7 +126,7 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
             from .folder import render_folder
 
             return render_folder(self, options)
-        images, depths, numbered = map(FramePattern.of, (self.image, self.depth, self.out))
+        images, depths, numbered, mattes = map(FramePattern.of, (self.image, self.depth, self.out, self.matte))
         keys = (self.focus_m or []) if images is None else []
         is_single = images is None and len(keys) < 2
         has_number = numbered and FramePattern.is_padded(self.out) and not FramePattern.is_padded(self.image)
@@ -137,7 +137,7 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
             (self.keep_layers and not are_exr, "--keep-layers is for an EXR that is written to an EXR; leave it out"),
             (not is_single and not numbered, no_number),
             (self.sheet and not is_single, "--sheet is of one picture; leave it out where there are more"),
-            (self.has_matte_file and images, "--matte is of one picture; leave it out with a sequence"),
+            (mattes and not images, f"{self.matte}: masks of frames are for a sequence; IMAGE is a single image"),
             (of_sequences, f"{self.image}: is a single image; for a sequence write it as shot.####.exr"),
             (images and self.blur, "--blur would open the lens anew in each frame of a sequence; give --f-number"),
             (self.steady and self.depth_kind == "coc", "--steady filters depth in metres; --depth-kind coc has none"),
@@ -146,13 +146,16 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
         def sources(n: int) -> tuple[Path, Path | None]:
             return images.name(n) if images else self.image, depths.name(n) if depths else self.depth
 
+        def matte(n: int) -> Path | None:
+            return mattes.name(n) if mattes else None
+
         numbers: Sequence[int] = [0]
         if images and not self.frames:
             numbers = images.frames()
         elif not is_single:
             first, last = self.frames or (keys[0][0], keys[-1][0])
             numbers = range(first, last + 1)
-            for pattern in filter(None, (images, depths)):
+            for pattern in filter(None, (images, depths, mattes)):
                 pattern.refuse_missing(numbers)
             refuse((len(numbers) > _MOST_FRAMES, f"{first}-{last} are {len(numbers)} frames, more than {_MOST_FRAMES}"))
         if not numbers:
@@ -160,7 +163,7 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
         outputs: dict[int, Path] = {}
         for n in numbers:
             outputs[n] = numbered.name(n) if numbered and not is_single else self.out
-            check_files(*sources(n), outputs[n], self.sheet)
+            check_files(*sources(n), outputs[n], self.sheet, matte=matte(n))
         whole = list(numbers)  # frames of the sequence, each of which may depend on those before it
         if images and self.steady:
             whole = [n for n in images.frames() if depths is None or depths.name(n).is_file()]
@@ -174,7 +177,7 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
                 writer = "another run is writing, or was killed a moment ago"
                 to_stderr(f"note: {self.out.parent}: {young} unfinished files (.part) stay, which {writer}")
         if self.resume and not reason:
-            done = record.kept(outputs, {n: [*sources(n), *self.files()] for n in whole}, self.steady)
+            done = record.kept(outputs, {n: [*sources(n), matte(n), *self.files()] for n in whole}, self.steady)
             reason = "they are older than their files or options, or they are cut short"
         if done:
             share = f"{self.out}: is" if is_single else f"{len(done)} of {len(outputs)} frames are"
@@ -207,7 +210,7 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
         places = {n: (k, len(all_frames)) for k, n in enumerate(all_frames)}
 
         def as_stored(n: int) -> "Frame":
-            return read_files(*sources(n), places.get(n))
+            return read_files(*sources(n), places.get(n), matte(n))
 
         steady = SteadyFrames(lambda k: (as_stored(whole[k]).picture.pixels, as_stored(whole[k]).values))
 

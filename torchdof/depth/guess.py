@@ -20,6 +20,7 @@ _NEAR_ZERO = 0.05  # numbers up to 1 are relative if the smallest is below this:
 _EMPTY_GAP = 0.1  # smallest number over the largest from which a 0 is no number of the map
 _KITTI_ASPECTS = (3.1, 3.7)  # width over height of KITTI's pictures, whose maps hold metres * 256
 _KITTI_EMPTY = 0.6  # share of zeros from which whole numbers are a lidar's, as in KITTI's maps
+_NO_METRES = 100.0  # m; a picture whose nearest surface is farther away has no depth of field
 _NEAR_SHARE = 0.1  # the same as a share of the largest: a close-up in metres rarely spans as much
 _CLEAR_DIFFERENCE = 0.3  # of mean ranks, in [0, 1], between the bottom's middle and the upper corners
 _CLEAR_CORRELATION = 0.35  # absolute correlation of values and rows above which values clearly grow or shrink downwards
@@ -49,7 +50,8 @@ def guess_kind(values: Tensor, integers: bool = False, metric: bool = False) -> 
     * Whole numbers are relative depth (grey levels) if the largest is at most 255, or at least 60,000. Otherwise they
       are millimetres, with 0 for pixels that were not measured; in maps of KITTI's shape, or if most are 0, metres
       times 256.
-    * Other numbers are relative depth if they lie in [0, 1] and come near 0, or if some are negative; else metres.
+    * Other numbers are relative depth if they lie in [0, 1] and come near 0, or if some are negative; else metres;
+      from 100 on, where nothing could be blurred, they are millimetres, or relative depth if a person is larger.
       A single negative number, such as -1, marks pixels without depth.
     * Relative depth is "disparity" (larger is nearer), unless the values clearly shrink downwards: the ground is nearer
       than the sky; or, where this is unclear, are smaller in the middle of the bottom than in the upper corners: a
@@ -83,8 +85,11 @@ def guess_kind(values: Tensor, integers: bool = False, metric: bool = False) -> 
         return Guess("relative", relative_kind="depth" if is_farther else "disparity", is_sure=is_sure)
     if downwards > _CLEAR_CORRELATION and not metric:
         return Guess("relative")
-    if not is_whole:
+    if not is_whole and (metric or low < _NO_METRES):
         return Guess("z")
+    if not is_whole:
+        is_nearer = _growth_to_person(values) > _CLEAR_DIFFERENCE
+        return Guess("relative", is_sure=False) if is_nearer else Guess("z", 0.001, 0.0)
     aspect = values.shape[-1] / values.shape[-2]
     is_of_kitti = _KITTI_ASPECTS[0] < aspect < _KITTI_ASPECTS[1] or float((values == 0).double().mean()) > _KITTI_EMPTY
     return Guess("z", 1 / 256 if is_of_kitti else 0.001, 0.0)

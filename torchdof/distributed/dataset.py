@@ -24,23 +24,32 @@ class Summary(NamedTuple):
     seconds: float  # processor time for all samples
 
 
-def pairs_in(images: str | os.PathLike[str], depths: str | os.PathLike[str] | None = None) -> list[Pair]:
+def pairs_in(
+    images: str | os.PathLike[str],
+    depths: str | os.PathLike[str] | None = None,
+    mattes: str | os.PathLike[str] | None = None,
+) -> list[Pair]:
     """Pairs each image of a folder with the depth file of the same name in another folder; full paths.
 
     Args:
         images: Folder of images.
         depths: Folder of depth maps; None uses the depth channels of the images.
+        mattes: Folder of subjects' masks of the same names for :func:`torchdof.io.matte.read_matte`, or None.
 
     Raises:
         FileNotFoundError: If a folder is missing or has no image.
-        ValueError: If an image has no depth file, or several.
+        ValueError: If an image has no depth file or mask, or several.
     """
-    photographs, maps = _by_stem(images, IMAGE_SUFFIXES), {} if depths is None else _by_stem(depths, MAP_SUFFIXES)
+    photographs = _by_stem(images, IMAGE_SUFFIXES)
     if not photographs:
         raise FileNotFoundError(f"{images}: no images here ({' '.join(IMAGE_SUFFIXES)})")
-    if depths is not None and (missing := [stem for stem in photographs if stem not in maps]):
-        raise ValueError(f"{photographs[missing[0]]}: needs a depth map {missing[0]}.* in {depths}, found none")
-    return [Pair(str(image), str(maps[stem]) if maps else None) for stem, image in photographs.items()]
+    maps = dict[str, dict[str, Path]]()
+    for name, folder in (("depth map", depths), ("mask", mattes)):
+        maps[name] = {} if folder is None else _by_stem(folder, MAP_SUFFIXES)
+        if folder is not None and (missing := [stem for stem in photographs if stem not in maps[name]]):
+            raise ValueError(f"{photographs[missing[0]]}: needs a {name} {missing[0]}.* in {folder}, found none")
+    files = {stem: [str(found[stem]) if found else None for found in maps.values()] for stem in photographs}
+    return [Pair(str(image), files[stem][0], matte=files[stem][1]) for stem, image in photographs.items()]
 
 
 def _by_stem(folder: str | os.PathLike[str], suffixes: tuple[str, ...]) -> dict[str, Path]:

@@ -23,6 +23,7 @@ from ..depth.read import read_depth
 from ..extras import missing
 from ..io.atomic import atomic_file, write_text
 from ..io.images import Picture, read_image, write_image
+from ..io.matte import read_matte
 from ..io.transfer import Transfer
 from ..module import depth_of_field
 from ..render.surfaces.resample import at_size_of
@@ -36,7 +37,10 @@ _FILES = ("blurred", "sharp", "depth")
 
 @dataclasses.dataclass(frozen=True)
 class Pair:
-    """An image file and its depth file. A depth of None uses the image's depth channel; other values of None are drawn.
+    """An image file, its depth file, and perhaps a subject's mask.
+
+    A depth of None uses the image's depth channel, a matte of None that of a portrait, if it has one. Other values of
+    None are drawn.
 
     Raises:
         ValueError: If a number is not positive.
@@ -50,6 +54,7 @@ class Pair:
     depth: str | None = None
     focus_m: float | None = None
     f_number: float | None = None
+    matte: str | None = None
 
     def __post_init__(self) -> None:
         for name in ("focus_m", "f_number"):
@@ -187,7 +192,9 @@ class RenderShards:
 
     def _source(self, samples: str) -> str:
         """Digest of all that determines a shard: settings, samples, and size and time of their files."""
-        files = {sample[name] for sample in json.loads(str(samples)) for name in ("image", "depth") if sample[name]}
+        files = {
+            sample[name] for sample in json.loads(str(samples)) for name in ("image", "depth", "matte") if sample[name]
+        }
         found = [os.stat(file) for file in sorted(files) if os.path.exists(file)]
         facts = [self.settings(), str(samples), [(file.st_size, file.st_mtime_ns) for file in found]]
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
@@ -222,7 +229,7 @@ class RenderShards:
         return rows
 
     def _record(
-        self, key: str, image: str, depth: str | None, focus_m: float | None, f_number: float | None
+        self, key: str, image: str, depth: str | None, focus_m: float | None, f_number: float | None, matte: str | None
     ) -> dict[str, Any]:
         """One sample as WebDataset takes it: its key, the contents of its files by name, its parameters as ``json``."""
         source = read_image(image, self.transfer)
@@ -234,8 +241,9 @@ class RenderShards:
             f_number=float(drawn["f_number"]) if f_number is None else f_number,
         )
         options = self.blur.renderings[int(drawn["table"])]
+        cover = read_matte(matte, source.pixels.shape[-2:], source.window) if matte else source.matte
         with torch.no_grad():
-            blurred = depth_of_field(source.pixels, metres, camera, **options.arguments())
+            blurred = depth_of_field(source.pixels, metres, camera, matte=cover, **options.arguments())
         record: dict[str, Any] = {"__key__": key}
         with tempfile.TemporaryDirectory() as folder:
             for name, pixels in (("blurred", blurred), ("sharp", source.pixels)):
@@ -252,7 +260,13 @@ class RenderShards:
             **{name: float(value) if isinstance(value, Tensor) else value for name, value in numbers.items()},
             **{"table": table.name or table.family, "table_fingerprint": table.fingerprint()},
             "aperture": None if table.aperture is None else repr(table.aperture),
-            **{"image": _text(image), "depth": depth and _text(depth), "height": height, "width": width},
+            **{
+                "image": _text(image),
+                "depth": depth and _text(depth),
+                "matte": matte and _text(matte),
+                "height": height,
+                "width": width,
+            },
             "largest_coc_px": float(camera.coc_px(metres, width).abs().nan_to_num().max()),
             **{"seed": self.seed, "torchdof": importlib.metadata.version("torchdof")},
         }

@@ -7,6 +7,8 @@ import numpy as np
 
 from .decode import Part
 
+_EYES = {"l": "left", "r": "right"}
+
 Place = tuple[int, int]
 """Index of a part, and of a channel in it."""
 
@@ -66,9 +68,10 @@ def _is_depth(part: Part, index: int) -> bool:
     """Whether a channel is depth by its name, by its layer's without other coordinates, or by its part's."""
     layer, channel = plain(part.names[index])
     word = channel.lower()
-    if word.endswith("depth") or (not layer and word in ("z", "pz")):
+    if word.endswith("depth") or (not layer and word == "pz"):
         return True
-    if word == "z" and not any(plain(name) in ((layer, "x"), (layer, "X")) for name in part.names):
+    is_coordinate = any(plain(name) in ((layer, "x"), (layer, "X")) for name in part.names)
+    if word == "z" and not is_coordinate and not layer.lower().endswith("mist"):  # Blender's mist is from 0 to 1
         return True
     in_own_part = _of_depth(part.label) and len(part.names) == 1
     return in_own_part or (_of_depth(layer) and channel.upper() in ("Z", "V", "Y", "R"))
@@ -99,16 +102,14 @@ def nearest_channel(parts: list[Part], places: Sequence[Place], layer: str = "")
     """The channel of depth that belongs to a layer: it shares most words of its name, and has the fewest others.
 
     Raises:
-        ValueError: If two channels of different numbers belong to it equally well, or all belong to the other eye; the
+        ValueError: If two channels of different numbers belong to it equally well, or all belong to other views; the
             message lists them.
     """
     wanted = _words(layer)
     listed = ", ".join(full_name(parts, place) for place in places)
-    other_eye = {"left": "right", "right": "left"}
-    others = {other_eye[word] for word in wanted & other_eye.keys()}
-    places = [place for place in places if not others & _words(full_name(parts, place).rpartition(".")[0])]
+    places = [place for place in places if not _is_of_other_view(parts, place, wanted)]
     if not places:
-        raise ValueError(f"its depth is that of the other eye: {listed}; name it (--depth-channel) if it is right")
+        raise ValueError(f"its depth is that of another view: {listed}; name it (--depth-channel) if it is right")
 
     def fit(place: Place) -> tuple[int, int]:
         words = _words(full_name(parts, place).rpartition(".")[0])
@@ -120,6 +121,21 @@ def nearest_channel(parts: list[Part], places: Sequence[Place], layer: str = "")
     if not all(np.array_equal(parts[p].values[..., k], first, equal_nan=True) for p, k in nearest[1:]):
         raise ValueError(f"which of its depth channels belongs to the image: {listed}? name it (--depth-channel)")
     return nearest[0]
+
+
+def _is_of_other_view(parts: list[Part], place: Place, wanted: set[str]) -> bool:
+    """Whether a channel belongs to another eye or numbered camera than an image with these words in its name.
+
+    A channel without a layer beside colours without one belongs to these.
+    """
+    part, words = parts[place[0]], _words(full_name(parts, place).rpartition(".")[0])
+    of_image, of_channel = _views(wanted), _views(words)
+    is_beside_colours = not words and all(("", name) in map(plain, part.names) for name in "RGB")
+    return bool(of_image) and (is_beside_colours if not of_channel else not of_image & of_channel)
+
+
+def _views(words: set[str]) -> set[str]:
+    return {_EYES.get(word, word) for word in words if re.fullmatch(r"[lr]|left|right|(cam|camera|view|eye)\d+", word)}
 
 
 def _words(name: str) -> set[str]:

@@ -1,8 +1,11 @@
-"""The encoding and the primaries that an image file states: PNG's gAMA and cICP, EXR's chromaticities."""
+"""The encoding and the primaries that an image file states: PNG's gAMA and cICP, profiles, EXR's chromaticities."""
 
-from collections.abc import Mapping
+import math
+import struct
+from collections.abc import Iterator, Mapping
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -23,11 +26,15 @@ _CICP_TRANSFERS: dict[int, Transfer] = {  # code of ITU-T H.273 -> encoding
     **{8: "linear", 13: "srgb", 16: "pq", 18: "hlg"},
 }
 _SRGB_GAMMAS = (2.15, 2.25)  # a gAMA of 1 / 2.2 without more stands for sRGB
+_PARAMETERS = ("g", "gab", "gabc", "gabcd", "gabcdef")  # of the formulas of ICC.1, 10.18: (a x + b)^g, c x below d
+_CURVE_PLACES = (0.25, 0.5, 0.75)  # encoded numbers at which a curve is compared
+_SRGB_LIGHT = (0.0508761, 0.2140411, 0.5225216)  # light of them in sRGB
+_LIKE_SRGB = 0.01  # largest difference in light of a curve that is taken for sRGB's
 _BRADFORD = ((0.8951, 0.2664, -0.1614), (-0.7502, 1.7135, 0.0367), (0.0389, -0.0685, 1.0296))
 
 
 def stated_transfer(attributes: Mapping[str, Any]) -> Transfer | None:
-    """The encoding that a PNG states, by OpenImageIO's attributes; None if that is sRGB, or if it states none.
+    """The encoding that a file states, by OpenImageIO's attributes; None if that is sRGB, or if it states none.
 
     cICP comes before a profile, and this before gAMA.
 
@@ -52,18 +59,42 @@ def stated_transfer(attributes: Mapping[str, Any]) -> Transfer | None:
 
 
 def _profile_gamma(profile: Any) -> float | None:
-    """The exponent of the red or grey curve of an ICC profile; None for other curves, such as that of sRGB."""
+    """The exponent of the red or grey curve of an ICC profile, from its value at 0.5; None for a curve like sRGB's."""
+    content = next((content for name, content in _tags(profile) if name in (b"rTRC", b"kTRC")), b"")
+    try:
+        light = _curve(content, np.array(_CURVE_PLACES))
+    except (struct.error, ValueError):  # cut short
+        return None
+    if np.abs(light - _SRGB_LIGHT).max() < _LIKE_SRGB or not 0.01 < light[1] < 0.9:
+        return None
+    return round(math.log(light[1]) / math.log(_CURVE_PLACES[1]), 4)
+
+
+def _tags(profile: Any) -> Iterator[tuple[bytes, bytes]]:
+    """Names of the tags of an ICC profile, and its content from each on."""
     content = bytes(profile)
     for start in range(132, min(len(content), 132 + 12 * 100), 12):
-        if content[start : start + 4] in (b"rTRC", b"kTRC"):
-            place = int.from_bytes(content[start + 4 : start + 8], "big")
-            kind, count, number = content[place : place + 4], content[place + 8 : place + 12], content[place + 12 :]
-            if kind == b"curv" and int.from_bytes(count, "big") <= 1:
-                return int.from_bytes(number[:2], "big") / 256 if any(count) else 1.0
-            if kind == b"para" and count[:2] == b"\0\0":
-                return int.from_bytes(number[:4], "big") / 65536
-            break
-    return None
+        yield content[start : start + 4], content[int.from_bytes(content[start + 4 : start + 8], "big") :]
+
+
+def _curve(content: bytes, encoded: np.ndarray) -> np.ndarray:
+    """Light of encoded numbers by a curve of an ICC profile, which is a table, an exponent or a formula."""
+    kind, count = content[:4], int.from_bytes(content[8:12], "big")
+    if kind == b"curv" and count != 1:
+        table = np.frombuffer(content, ">u2", count, 12) / 65535 if count else np.array([0.0, 1.0])
+        return np.interp(encoded, np.linspace(0.0, 1.0, len(table)), table)
+    if kind == b"curv":
+        return encoded ** (int.from_bytes(content[12:14], "big") / 256)
+    formula = int.from_bytes(content[8:10], "big") if kind == b"para" else -1
+    if not 0 <= formula < len(_PARAMETERS):
+        raise ValueError
+    numbers = struct.unpack_from(f">{len(_PARAMETERS[formula])}i", content, 12)
+    p = dict.fromkeys("bcdef", 0.0) | {"a": 1.0}
+    p |= {name: number / 65536 for name, number in zip(_PARAMETERS[formula], numbers, strict=True)}
+    if formula in (1, 2):  # both have their threshold where the base is 0; c is added everywhere
+        p |= {"d": -p["b"] / (p["a"] or 1.0), "e": p["c"], "f": p["c"], "c": 0.0}
+    power = np.maximum(p["a"] * encoded + p["b"], 0.0) ** p["g"] + p["e"]
+    return np.where(encoded >= p["d"], power, p["c"] * encoded + p["f"])
 
 
 def stated_primaries(metadata: Mapping[str, tuple[Any, Any]]) -> Chromaticities | None:
@@ -71,11 +102,31 @@ def stated_primaries(metadata: Mapping[str, tuple[Any, Any]]) -> Chromaticities 
     given = metadata.get("chromaticities", (None, None))[1]
     if given is None and "CICP" in metadata:
         given = _CICP_PRIMARIES.get(int(metadata["CICP"][1][0]))
+    elif given is None and "ICCProfile" in metadata:
+        given = _profile_primaries(metadata["ICCProfile"][1])
     if given is None or len(given) != 8:
         return None
     stated = tuple(float(number) for number in given)
     is_rec709 = all(abs(one - other) < 2e-3 for one, other in zip(stated, REC709, strict=True))
     return None if is_rec709 else stated
+
+
+def _profile_primaries(profile: Any) -> Chromaticities | None:
+    """Chromaticities of an ICC profile under its white, D50; None without a matrix, or if they are those of sRGB."""
+    tags = {name: content for name, content in _tags(profile) if name in (b"rXYZ", b"gXYZ", b"bXYZ")}
+    try:
+        columns = [np.array(struct.unpack_from(">3i", tags[name], 8)) / 65536 for name in (b"rXYZ", b"gXYZ", b"bXYZ")]
+    except (KeyError, struct.error):
+        return None
+    colours = [*columns, np.sum(columns, axis=0)]
+    if min(colour.sum() for colour in colours) <= 0 or colours[3][1] <= 0:
+        return None
+    places = tuple(float(number) for colour in colours for number in colour[:2] / colour.sum())
+    try:
+        white = in_rec709(torch.eye(3, dtype=torch.float64).reshape(1, 3, 3, 1), places)[0, ..., 0]
+    except ValueError:
+        return None
+    return None if float((white - torch.eye(3, dtype=torch.float64)).abs().max()) < _LIKE_SRGB else places
 
 
 def in_rec709(pixels: Tensor, primaries: Chromaticities) -> Tensor:

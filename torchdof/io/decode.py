@@ -42,7 +42,7 @@ class Part:
     metadata: Metadata = dataclasses.field(default_factory=dict)
     window: tuple[int, int, int, int, int, int] | None = None  # x, y, full x, full y, full width, full height
     orientation: int = 1  # EXIF orientation as stored; the values are upright already
-    stated: dict[str, Any] = dataclasses.field(default_factory=dict)  # what a PNG states of its encoding
+    stated: dict[str, Any] = dataclasses.field(default_factory=dict)  # what the file states of its encoding
 
 
 @contextlib.contextmanager
@@ -126,10 +126,16 @@ def _parts(name: str) -> Iterator[Part]:
                 metadata=metadata,
                 window=window if values.shape[:2] == (spec.height, spec.width) else None,
                 orientation=orientation,
-                stated={a.name: a.value for a in spec.extra_attribs} if source.format_name() == "png" else {},
+                stated=_stated(spec, source.format_name() == "png"),
             )
     finally:
         source.close()
+
+
+def _stated(spec: Any, is_png: bool) -> dict[str, Any]:
+    """The attributes that state the encoding: of a PNG all, of other files of integers the profile."""
+    names = {"ICCProfile"} if str(spec.format) in ("uint8", "uint16") else set[str]()
+    return {a.name: a.value for a in spec.extra_attribs if is_png or a.name in names}
 
 
 def _png_primaries(path: Path) -> tuple[float, ...] | None:
@@ -227,12 +233,12 @@ def _read_pfm(path: Path) -> Part:
         problem = "is cut short" if len(data) < byte_count else "is longer than its header says"
         raise OSError(f"{problem} ({len(data)} of {byte_count} bytes of pixels)")
     values = np.frombuffer(data, dtype="<f4" if scale.startswith(b"-") else ">f4").astype(np.float32)
-    _refuse_noise(values)
+    refuse_noise(values)
     values = values.reshape(height, width, len(names))[::-1]  # the bottom row is stored first
     return Part("", tuple(names), values, ("float",) * len(names))
 
 
-def _refuse_noise(values: np.ndarray) -> None:
+def refuse_noise(values: np.ndarray) -> None:
     """Refuses floating-point numbers whose magnitudes are those of bytes in a wrong order or from a wrong place.
 
     A quarter of random single-precision numbers is smaller than 1e-18, and a quarter is larger than 1e18. One or two
@@ -299,8 +305,6 @@ def read_array(path: Path, key: str | None, place: tuple[int, int] | None = None
     if array.ndim != 2 or array.dtype.kind not in kinds or array.size == 0:
         raise ValueError(f"expected an array [H, W] of numbers, got {list(shape)} of {array.dtype}")
     check_size(array.shape[1], array.shape[0], array.dtype.itemsize + 4)
-    if array.dtype.kind == "f":
-        _refuse_noise(array)
     return np.asarray(array)
 
 

@@ -1,8 +1,9 @@
 """Reads and writes images in linear light: EXR, PNG, TIFF, JPEG, WebP, HDR and PFM, with OpenImageIO.
 
 Files of integers (PNG, JPEG, TIFF of 8 or 16 bits) are sRGB, and files of floats (EXR, HDR, PFM, TIFF of floats) linear
-light, unless the argument ``transfer`` changes that, or a PNG states another encoding (gAMA, cICP). Other tags are
-ignored. Primaries are kept where the written file can state them, and are otherwise converted to those of sRGB.
+light, unless the argument ``transfer`` changes that, or a file of integers states another encoding: a PNG by gAMA or
+cICP, any by the curve of its profile, which is read as an exponent. Other tags are ignored. Primaries are kept where
+the written file can state them, and are otherwise converted to those of sRGB.
 """
 
 import dataclasses
@@ -21,7 +22,7 @@ from ..validation import choice, real_tensor, show
 from .atomic import atomic_file
 from .channels import colour_channels, depth_channels, named_channels, nearest_channel
 from .colour import in_rec709, stated_primaries, stated_transfer
-from .decode import Part, errors_named, first_line, is_complete, read_array, read_parts, utf8_name
+from .decode import Part, errors_named, first_line, is_complete, read_array, read_parts, refuse_noise, utf8_name
 from .heif import heif_maps, read_heif
 from .jpeg import jpeg_maps
 from .layers import LOSSLESS, OF_LAYERS, Layers
@@ -39,6 +40,7 @@ _SAMPLE_TYPES: dict[str, PixelType] = {name: sample for sample, name in _OIIO_SA
 _WHITE = {"8": 255.0, "16": 65535.0, "half": 1.0, "float": 1.0}
 _ALPHA_SUFFIXES = (".exr", ".png", ".tif", ".tiff", ".webp")
 _GREY_SUFFIXES = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".pfm")
+_PROFILE_SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".webp")
 _JPEG = {"compression": "jpeg:95", "jpeg:subsampling": "4:4:4"}
 _SETTINGS: dict[str, Mapping[str, object]] = {
     **{".jpg": _JPEG, ".jpeg": _JPEG, ".webp": {"compression": "webp:95"}},
@@ -57,7 +59,7 @@ class Picture:
             pixels without depth, it is NaN.
         metadata: Name -> (OpenImageIO type, value).
         sample: Stored type of a sample: "8", "16", "half" or "float".
-        transfer: Encoding of the file: "linear" or "srgb", or another one that a PNG states.
+        transfer: Encoding of the file: "linear" or "srgb", or another one that it states.
         is_stated: Whether the file states its encoding, and that is not sRGB.
         window: Place of the pixels in the full frame (EXR data window): x, y, full x, full y, full width, full height.
         orientation: EXIF orientation of the file; the pixels are upright already.
@@ -105,7 +107,7 @@ def read_image(
     Args:
         path: An EXR, PNG, TIFF, JPEG, WebP, HDR or PFM file; HEIC and AVIF with ``pip install 'torchdof[heif]'``; raw
             files if OpenImageIO was built to read them.
-        transfer: "linear" or "srgb"; None uses what a PNG states, else "srgb" for integers and "linear" for floats.
+        transfer: "linear" or "srgb"; None uses what the file states, else "srgb" for integers and "linear" for floats.
         layer: Name of the part or layer of an EXR file to read; None takes the first that has colour.
         keep_layers: Keep the other layers and parts of an EXR file, so that a copy has them too.
 
@@ -231,6 +233,16 @@ def _strips(height: int, numbers_per_row: int) -> list[slice]:
     return [slice(top, top + rows) for top in range(0, height, rows)]
 
 
+def can_state_transfer(picture: Picture, suffix: str) -> bool:
+    """Whether a file of a type can state the encoding of a picture: a PNG any, others sRGB or that of a profile."""
+    return suffix == ".png" or not picture.is_stated or keeps_profile(picture, suffix)
+
+
+def keeps_profile(picture: Picture, suffix: str) -> bool:
+    """Whether a file of a type keeps the profile of a picture, if its encoding is not changed."""
+    return suffix in _PROFILE_SUFFIXES and "ICCProfile" in picture.metadata and "CICP" not in picture.metadata
+
+
 def write_image(
     path: str | os.PathLike[str], picture: Picture, transfer: Transfer | None = None, sample: PixelType | None = None
 ) -> None:
@@ -264,7 +276,7 @@ def write_image(
         raise ValueError(f"{path}: a {suffix} file holds samples of {' or '.join(sample_types)}, not {sample}")
     if transfer is None:
         both_floats_or_integers = default_transfer(sample) == default_transfer(picture.sample)
-        is_kept = both_floats_or_integers and (suffix == ".png" or not picture.is_stated)
+        is_kept = both_floats_or_integers and can_state_transfer(picture, suffix)
         transfer = picture.transfer if is_kept else default_transfer(sample)
     pixels = real_tensor("pixels", picture.pixels, "[1, C, H, W] in linear light").detach().cpu().float()
     names = picture.channels
@@ -277,7 +289,8 @@ def write_image(
     primaries = stated_primaries(picture.metadata)
     codes = {name: value for name, (_, value) in picture.metadata.items() if name == "CICP"}
     is_cicp = bool(codes) and suffix == ".png" and transfer == (stated_transfer(codes) or "srgb")
-    if primaries is not None and names[0] == "R" and suffix != ".exr" and not is_cicp:
+    has_profile = keeps_profile(picture, suffix) and transfer == picture.transfer
+    if primaries is not None and names[0] == "R" and suffix != ".exr" and not is_cicp and not has_profile:
         try:
             pixels = in_rec709(pixels, primaries)
         except ValueError as error:
@@ -300,8 +313,8 @@ def write_image(
     if picture.window is not None:
         spec.x, spec.y, spec.full_x, spec.full_y, spec.full_width, spec.full_height = picture.window
     for name, (kind, value) in picture.metadata.items():
-        is_lossless = suffix == ".exr" and value in LOSSLESS
-        is_same = {"ICCProfile": transfer == picture.transfer, "CICP": is_cicp, "chromaticities": suffix == ".exr"}
+        is_lossless = suffix == ".exr" and name == "compression" and value in LOSSLESS
+        is_same = {"ICCProfile": has_profile, "CICP": is_cicp, "chromaticities": suffix == ".exr"}
         is_lost = picture.layers is None and re.match(OF_LAYERS, name) is not None
         if {"compression": is_lossless, **is_same}.get(name, not is_lost):
             typed = (value,) if isinstance(value, int) else (kind, value)  # with a 16-bit type it would be dropped
@@ -314,7 +327,7 @@ def write_image(
         spec.attribute("oiio:ColorSpace", "srgb_rec709_scene" if transfer == "srgb" else "lin_rec709_scene")
     if suffix == ".exr" and primaries is not None:
         spec.attribute("chromaticities", "float[8]", primaries)
-    if transfer == "linear" and suffix != ".exr":
+    if transfer != "srgb" and suffix != ".exr":
         spec.attribute("Exif:ColorSpace", 65535)  # "uncalibrated"; OpenImageIO cannot write a TIFF without any EXIF
     if straight:
         spec.attribute("oiio:UnassociatedAlpha", 1)
@@ -410,7 +423,8 @@ def _map_channel(parts: list[Part], channel: str | None, layer: str) -> tuple[in
     if found := depth_channels(parts):
         return nearest_channel(parts, found, layer)
     first = parts[0].values[..., 0]
-    if all(np.array_equal(parts[n].values[..., k], first) for n, k in every if parts[n].names[k] != "A"):
+    is_float = first.dtype.kind == "f"  # a hole may be NaN
+    if all(np.array_equal(parts[n].values[..., k], first, is_float) for n, k in every if parts[n].names[k] != "A"):
         return every[0]
     advice = "name it (--depth-channel); the colours of a heat map are no depth: save the map in grey, or as .npy"
     raise ValueError(f"which of the channels {names} is depth? {advice}")
@@ -423,7 +437,9 @@ def _placed(part: Part, channel: int, size: Sequence[int], target: Window | None
 
 
 def _map(values: np.ndarray) -> Tensor:
-    """Numbers ``[H, W]`` as ``[1, 1, H, W]``."""
+    """Numbers ``[H, W]`` as ``[1, 1, H, W]``, unless they are like random bytes."""
+    if values.dtype.kind == "f":
+        refuse_noise(values)
     return torch.from_numpy(_float32(values))[None, None]
 
 

@@ -11,11 +11,12 @@ from torch.nn.functional import interpolate
 from ..validation import stretch
 from .decode import errors_named, read_array, read_parts
 from .paths import existing_map
+from .windows import Window, placed
 
 __all__ = ["matte_of_size", "read_matte"]
 
 
-def read_matte(path: str | os.PathLike[str], size: Sequence[int] | None = None) -> Tensor:
+def read_matte(path: str | os.PathLike[str], size: Sequence[int] | None = None, window: Window | None = None) -> Tensor:
     """Reads a subject's mask: ``[1, 1, H, W]`` float32 coverage in [0, 1].
 
     The numbers are coverage, without a transfer curve: whole numbers are divided by the largest of their type (255 for
@@ -24,6 +25,8 @@ def read_matte(path: str | os.PathLike[str], size: Sequence[int] | None = None) 
     Args:
         path: An image of one channel, of equal ones or with alpha; or a ``.npy`` or ``.npz`` file.
         size: Height and width of the photograph, to which the mask is resampled; None keeps its own.
+        window: Data window of the photograph, as in :class:`torchdof.io.images.Picture`. With it, the mask is placed by
+            its own data window, and is 0 outside.
 
     Raises:
         OSError: If the file is missing, empty or damaged.
@@ -38,10 +41,12 @@ def read_matte(path: str | os.PathLike[str], size: Sequence[int] | None = None) 
     """
     path = existing_map(path)
     with errors_named(path):
+        own_window = None
         if path.suffix.lower() in (".npy", ".npz"):
             values = read_array(path, None, kinds="fiub")
         else:
             part = read_parts(path)[0]
+            own_window = part.window if part.is_exr else None
             if "A" in part.names and len(part.names) > 1:
                 values = part.values[..., part.names.index("A")]
             elif bool((part.values == part.values[..., :1]).all()):
@@ -50,6 +55,8 @@ def read_matte(path: str | os.PathLike[str], size: Sequence[int] | None = None) 
                 raise ValueError(f"a matte must have one channel or alpha, it has {', '.join(part.names)}, all unequal")
         if values.dtype.kind in "iu" and (values.size == 0 or values.max() > 1):
             values = values / np.iinfo(values.dtype).max
+        if size is not None and (window or own_window):
+            values = np.nan_to_num(placed(values.astype(np.float32), own_window, (size[0], size[1]), window))
         matte = torch.from_numpy(np.array(values, np.float32))[None, None]
         if not bool(((matte >= 0) & (matte <= 1)).all()):
             low, high = float(matte.min()), float(matte.max())

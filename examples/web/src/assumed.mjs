@@ -10,6 +10,7 @@ const LEAST_LEVELS = 16 // fewer different whole numbers may be floating-point n
 const NEAR_ZERO = 0.05
 const NEAR_SHARE = 0.1 // the same as a share of the largest number
 const EMPTY_GAP = 0.1 // smallest number over the largest from which a 0 is no number of the map
+const NO_METRES = 100 // m; a picture whose nearest surface is farther away has no depth of field
 const KITTI_ASPECTS = [3.1, 3.7] // width over height of KITTI's pictures, whose maps hold metres * 256
 const KITTI_EMPTY = 0.6 // share of zeros from which whole numbers are a lidar's, as in KITTI's maps
 const CLEAR_CORRELATION = 0.35
@@ -29,7 +30,7 @@ const PER_OUTLIER = 1000 // one pixel in 1000 is ignored as an outlier
  *
  * Whole numbers are relative depth if the largest is at most 255 or at least 60,000, else millimetres; in maps of KITTI's
  * shape, or if most are 0, metres times 256. Other numbers are relative depth if they lie in [0, 1] and come near 0, or if
- * some are negative, else metres. Relative depth is larger for nearer surfaces, unless it clearly shrinks downwards, because
+ * some are negative, else metres; from 100 on millimetres, or relative depth if a person is larger. Relative depth is larger for nearer surfaces, unless it clearly shrinks downwards, because
  * the ground is nearer than the sky; or, where this is unclear, is smaller in the middle of the bottom than in the upper
  * corners, because a person is nearer than the background.
  *
@@ -59,7 +60,11 @@ export function guessMeaning(map) {
     return { kind: isFarther ? 'depth' : 'disparity', scale: 1 }
   }
   if (downwards > CLEAR_CORRELATION) return { kind: 'disparity', scale: 1 }
-  if (!isWhole) return { kind: 'metres', scale: 1 }
+  if (!isWhole && low < NO_METRES) return { kind: 'metres', scale: 1 }
+  if (!isWhole) {
+    const isNearer = growthToPerson(values, width, height, isHole) > CLEAR_DIFFERENCE
+    return isNearer ? { kind: 'disparity', scale: 1 } : { kind: 'metres', scale: 0.001 }
+  }
   const [aspect, empty] = [width / height, values.filter((value) => value === 0).length / values.length]
   const isOfKitti = (KITTI_ASPECTS[0] < aspect && aspect < KITTI_ASPECTS[1]) || empty > KITTI_EMPTY
   return { kind: 'metres', scale: isOfKitti ? 1 / 256 : 0.001 }
