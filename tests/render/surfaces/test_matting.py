@@ -69,3 +69,11 @@ def test_noise_of_a_blurred_surface_does_not_reach_a_sharper_one(engine: str, ne
     assert int(mixed.sum()) == 32
     light = surfaces.other.movedim(1, -1)[mixed[:, 0]]  # [32, 3]
     assert float(light.std(0).mean()) < 0.3 * float(noise.std())
+
+
+@pytest.mark.parametrize(("near_px", "far_px", "splits"), [(-31.5, -30, False), (-31.5, -20, True), (-1.5, 0, True)])
+def test_surfaces_of_hardly_another_blur_are_one(engine: str, near_px: float, far_px: float, splits: bool) -> None:
+    """A split there would take the place of the hidden sample, and light from far behind would pass beside the edge."""
+    image, coc = mixed_edge(0.6)
+    split = matte(image, torch.where(coc < 0, near_px, far_px))
+    assert bool((split.other_weight > 0).any()) == splits

@@ -28,6 +28,7 @@ namespace {
 
 // Constants of matting.py and pipeline.py in render, which give their meanings, units and effects.
 constexpr float EDGE_PX = constants::matting::EDGE_PX;
+constexpr float SAME_BLUR = constants::matting::SAME_BLUR;
 constexpr float UNCLEAN = constants::matting::UNCLEAN;
 constexpr float TRUST = constants::matting::TRUST;
 constexpr float TEXTURE = constants::matting::TEXTURE;
@@ -45,6 +46,9 @@ constexpr int MARGIN = RIM + 1;           // edges depend on the pixels next to 
 constexpr int SIDE = BLOCK + 2 * MARGIN;  // of the window of coc
 constexpr int EDGES = BLOCK + 2 * RIM;    // of the windows of edges and light
 constexpr int PITCH = 24;                 // of all
+
+// How clearly two cocs around a pixel are those of two surfaces: none from 0 down, in full from 1 on.
+vec edge_of(vec near, vec far) { return (far - near - SAME_BLUR * min(abs(near), abs(far))) * (1.0f / EDGE_PX) - 1.0f; }
 
 // Falloff of the Gaussian by which two surfaces mix, beside its centre.
 constexpr float SMALL_BESIDE = constants::matting::SOFTNESS_FALLOFF;
@@ -128,8 +132,8 @@ bool find_edges(const Frame &frame, int y0, int x0, Window &w) {
     for (int j = 0; j < PITCH; j += LANES) {
       auto high_of = [&](int k) { return load<vec>(most_of + j + k); };
       auto low_of = [&](int k) { return load<vec>(least_of + j + k); };
-      const vec gap = max(max(high_of(0), high_of(1)), high_of(2)) - min(min(low_of(0), low_of(1)), low_of(2));
-      const vec edge = clamp01(gap * (1.0f / EDGE_PX) - 1.0f);
+      const vec near = min(min(low_of(0), low_of(1)), low_of(2)), far = max(max(high_of(0), high_of(1)), high_of(2));
+      const vec edge = clamp01(edge_of(near, far));
       store(w.edge + i * PITCH + j, valid ? edge * load<vec>(w.valid + (i + 1) * PITCH + j + 1) : edge);
     }
   }
@@ -698,10 +702,16 @@ void back_of_block(const Frame &frame, int by, int bx, Window &w, const float *f
     for (int j = 0; j < EDGES; j += LANES) {
       const int at = i * PITCH + j;
       const Ends ends(w, at, frame.valid);
-      const vec rise = (ends.far - ends.near) * (1.0f / EDGE_PX) - 1.0f;
+      const vec rise = edge_of(ends.near, ends.far);
       const vec slope =
           select(is_within(rise) & (load<vec>(w.edge + at) > vec{}), load<vec>(slopes.edge + at) * (1.0f / EDGE_PX));
-      if (any_of(slope != vec{})) ends.back(w, at, frame.valid, -slope, slope, slopes.coc);
+      // the smaller of both blurs is that of one surface, or of both by halves
+      const vec near_blur = abs(ends.near), far_blur = abs(ends.far);
+      const vec part = SAME_BLUR * slope * (near_blur == far_blur ? broadcast(0.5f) : broadcast(1.0f));
+      const vec d_near_blur = select(near_blur <= far_blur, part), d_far_blur = select(far_blur <= near_blur, part);
+      const vec d_near = -slope - select(ends.near > vec{}, d_near_blur) + select(ends.near < vec{}, d_near_blur);
+      const vec d_far = slope - select(ends.far > vec{}, d_far_blur) + select(ends.far < vec{}, d_far_blur);
+      if (any_of(slope != vec{})) ends.back(w, at, frame.valid, d_near, d_far, slopes.coc);
     }
   const auto add_window = [&](const float *window, int size, int margin, float *to) {
     for (int i = 0; i < size; i++)

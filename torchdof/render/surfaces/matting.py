@@ -163,7 +163,7 @@ def _edge_pixels(light: Tensor, coc_px: Tensor, valid: Tensor | None, ops: Ops) 
     known = None if valid is None else valid > 0
     high, low = (c if known is None else torch.where(known, c, -NEVER_PX) for c in (coc_px.detach(), -coc_px.detach()))
     high, low = (functional.max_pool2d(c, 3, stride=1, padding=1) for c in (high, low))
-    is_edge = high + low > _EDGE_PX
+    is_edge = _apart_px(-low, high) > _EDGE_PX
     chosen = ops.select(is_edge if known is None else is_edge & known)
 
     own_light, around, coc_around = chosen.pick(light), chosen.around(light), chosen.around(coc_px)[0]
@@ -173,11 +173,17 @@ def _edge_pixels(light: Tensor, coc_px: Tensor, valid: Tensor | None, ops: Ops) 
     if counts is not None:
         near_px, far_px = torch.where(counts > 0, near_px, NEVER_PX), torch.where(counts > 0, far_px, -NEVER_PX)
     near_px, far_px = near_px.amin(0), far_px.amax(0)
-    # in a strong blur a small difference is not seen, and a split would keep the hidden sample out of the pixel
-    one_surface_px = _SAME_BLUR * torch.minimum(near_px.abs(), far_px.abs())
-    certainty = ((far_px - near_px - one_surface_px) / _EDGE_PX - 1.0).clamp(0.0, 1.0)
+    certainty = (_apart_px(near_px, far_px) / _EDGE_PX - 1.0).clamp(0.0, 1.0)
     lights, cocs = (own_light / brightest, around / brightest), (chosen.pick(coc_px)[0], coc_around)
     return _EdgePixels(chosen, brightest, *lights, *cocs, counts, near_px, far_px, certainty)
+
+
+def _apart_px(near_px: Tensor, far_px: Tensor) -> Tensor:
+    """Difference in coc of two surfaces, less the part that is not seen in a strong blur.
+
+    A split for this part would keep the hidden sample out of the pixel.
+    """
+    return far_px - near_px - _SAME_BLUR * torch.minimum(near_px.abs(), far_px.abs())
 
 
 def _colours(edge: _EdgePixels, light: Tensor, coc_px: Tensor) -> tuple[_Colour, _Colour]:
