@@ -70,8 +70,7 @@ def slim(model: onnx_ir.Model, straight: bool = False) -> onnx_ir.Model:
         passes.RemoveUnusedNodesPass(),
         passes.RemoveUnusedOpsetsPass(),
         passes.ClearMetadataAndDocStringPass(),
-        *(() if straight else (_place_weights, passes.RemoveUnusedNodesPass(), _as_nodes)),
-        *((_separate,) if straight else ()),
+        *((_separate,) if straight else (_place_weights, passes.RemoveUnusedNodesPass(), _as_nodes)),
         _drop_defaults,
         _shorten,
     )

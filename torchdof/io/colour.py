@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .transfer import Transfer
+from .transfer import Transfer, decode
 
 Chromaticities = tuple[float, ...]
 """x and y of red, green, blue and white, as EXR files state them."""
@@ -28,7 +28,6 @@ _CICP_TRANSFERS: dict[int, Transfer] = {  # code of ITU-T H.273 -> encoding
 _SRGB_GAMMAS = (2.15, 2.25)  # a gAMA of 1 / 2.2 without more stands for sRGB
 _PARAMETERS = ("g", "gab", "gabc", "gabcd", "gabcdef")  # of the formulas of ICC.1, 10.18: (a x + b)^g, c x below d
 _CURVE_PLACES = (0.25, 0.5, 0.75)  # encoded numbers at which a curve is compared
-_SRGB_LIGHT = (0.0508761, 0.2140411, 0.5225216)  # light of them in sRGB
 _LIKE_SRGB = 0.01  # largest difference in light of a curve that is taken for sRGB's
 _BRADFORD = ((0.8951, 0.2664, -0.1614), (-0.7502, 1.7135, 0.0367), (0.0389, -0.0685, 1.0296))
 
@@ -61,11 +60,13 @@ def stated_transfer(attributes: Mapping[str, Any]) -> Transfer | None:
 def _profile_gamma(profile: Any) -> float | None:
     """The exponent of the red or grey curve of an ICC profile, from its value at 0.5; None for a curve like sRGB's."""
     content = next((content for name, content in _tags(profile) if name in (b"rTRC", b"kTRC")), b"")
+    places = np.array(_CURVE_PLACES)
+    srgb = decode(torch.from_numpy(places), "srgb", has_alpha=False, straight=False).numpy()
     try:
-        light = _curve(content, np.array(_CURVE_PLACES))
+        light = _curve(content, places)
     except (struct.error, ValueError):  # cut short
         return None
-    if np.abs(light - _SRGB_LIGHT).max() < _LIKE_SRGB or not 0.01 < light[1] < 0.9:
+    if np.abs(light - srgb).max() < _LIKE_SRGB or not 0.01 < light[1] < 0.9:
         return None
     return round(math.log(light[1]) / math.log(_CURVE_PLACES[1]), 4)
 
