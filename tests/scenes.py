@@ -413,3 +413,23 @@ def assert_same_picture(plain: Tensor, compiled: Tensor, image: Tensor) -> None:
     light = functional.pad(torch.maximum(plain.abs(), image), (8,) * 4, mode="replicate")
     nearby = functional.max_pool2d(light, 17, 1).amax(1, keepdim=True)
     assert float(((plain - compiled).abs() / (nearby + 1e-6)).max()) <= 1e-5
+
+
+def pixels_from_post(width: int) -> Tensor:
+    """Pixels from the post to each column."""
+    return (torch.arange(width) - 70).abs() - 20
+
+
+def furry_post(background: float = 0.8, height: int = 224, width: int = 160) -> tuple[Tensor, Tensor, Tensor]:
+    """An image of a dark furry post before a smooth background, a map of the coc without its hairs, and the exact map.
+
+    Four rows of five have hairs, two to eight px long, on both sides.
+    """
+    generator = torch.Generator().manual_seed(0)
+    lengths = torch.randint(2, 9, (height // 2 + 1,), generator=generator).repeat_interleave(2)[:height, None]
+    beside = pixels_from_post(width) - lengths * (torch.arange(height) % 5 < 4)[:, None]
+    is_near = beside < 0
+    light = torch.where(is_near, 0.05, background) * (1 + 0.02 * torch.randn(height, width, generator=generator))
+    given = torch.where(pixels_from_post(width) < 0, -12.0, 0.5).expand(height, -1)
+    exact = torch.where(is_near, -12.0, 0.5)
+    return light.clamp_min(0).expand(1, 3, -1, -1).contiguous(), given[None, None].contiguous(), exact[None, None]

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.scenes import furry_post
 from torchdof import Camera, blur_by_coc
 from torchdof.export import describe
 from torchdof.export.verification import TOLERANCE, local_range, session
@@ -15,6 +16,7 @@ from torchdof.options import DepthEdges
 from torchdof.reference.degraded import degrade
 from torchdof.reference.scenes import Plane, plane_scene, posts, waves
 from torchdof.render.layers.plan import Plan
+from torchdof.render.rules import without
 from torchdof.render.surfaces import edges
 
 KINDS = ("half-res", "near -1px", "exact")
@@ -85,3 +87,16 @@ def test_a_file_without_edges_to_repair_is_bit_exact_in_focus(
     image = tensors[0]
     got = runner.run(None, {"image": image.numpy(), "coc_px": np.zeros_like(tensors[1])})[0]
     assert np.array_equal(got, image.numpy())
+
+
+def test_a_file_blurs_the_hair_that_the_map_misses(
+    runner: onnxruntime.InferenceSession, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
+    image, coc, _ = furry_post()
+    image = image[:, :1].contiguous()
+    expected = rendered(image, coc, "auto")
+    with without(["missed_parts"]):
+        assert float((expected - rendered(image, coc, "auto")).abs().max()) > 0.1
+    got = runner.run(None, {"image": image.numpy(), "coc_px": coc.numpy()})[0]
+    assert error(got, expected, image) <= TOLERANCE

@@ -421,12 +421,25 @@ def repair_edges(light: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_c
     ``light`` is ``[C, H, W]``, ``nearness`` ``[H, W]``, ``step`` ``[H, W]`` or ``[]``. The result ``[H, W]`` is the
     input itself if it needs no repair.
     """
-    out, cancelled, changed = _empty(*nearness.shape), ctypes.c_int32(0), ctypes.c_int32(0)
     steps = (None, float(step)) if step.ndim == 0 else (step, 0.0)
-    maps = (*nearness.shape, light.shape[0], light, nearness, of_coc, *steps)
-    scene = _API.structures["map"](*maps, auto, _threads(), ctypes.pointer(cancelled), out)
-    _interruptible(lambda: _run("repair_edges", scene, changed), cancelled, nearness.numel())
-    return out if changed.value else nearness
+    return _changed("repair_edges", light, nearness, of_coc, *steps, auto)
+
+
+def missed_parts(light: Tensor, coc_px: Tensor) -> Tensor:
+    """Completes a map of the coc, as :func:`torchdof.render.surfaces.missed.completed`, for one image.
+
+    ``light`` is ``[C, H, W]``, ``coc_px`` ``[H, W]``. The result ``[H, W]`` is the input itself if it stays unchanged.
+    """
+    return _changed("missed_parts", light, coc_px, True, None, 0.0, False)
+
+
+def _changed(function: str, light: Tensor, map_: Tensor, *options: Any) -> Tensor:
+    """What a function of ``api.h`` makes of a map, or the map itself if it stays unchanged."""
+    out, cancelled, changed = _empty(*map_.shape), ctypes.c_int32(0), ctypes.c_int32(0)
+    maps = (*map_.shape, light.shape[0], light, map_, *options)
+    scene = _API.structures["map"](*maps, _threads(), ctypes.pointer(cancelled), out)
+    _interruptible(lambda: _run(function, scene, changed), cancelled, map_.numel())
+    return out if changed.value else map_
 
 
 def coc_px(depth: Tensor, scale: float, nearest_m: float, farthest_m: float) -> Tensor:

@@ -127,6 +127,9 @@ typedef struct {
 // changed: 0 if the map needs no repair; out is then not written.
 TORCHDOF_API int32_t torchdof_repair_edges(const torchdof_map *map, int32_t *changed);
 
+// Gives missed fine parts of blurred foregrounds to them, in a map of coc; reads neither steps nor `automatic`.
+TORCHDOF_API int32_t torchdof_missed_parts(const torchdof_map *map, int32_t *changed);
+
 // A padded frame whose layers are blurred and composited: surfaces of each pixel, all of them with a margin.
 typedef struct {
   int32_t rows, columns;       // of the maps; multiples of the largest scale, as is the margin

@@ -26,6 +26,7 @@ from ...validation import ends
 from ..engines.ops import EAGER, Ops
 from ..engines.traced import is_compiled, one_operator
 from ..rules import active
+from .missed import completed
 
 __all__ = ["STEP_PX", "judged", "mended", "repair", "repair_edges"]
 
@@ -182,6 +183,7 @@ def mended(image: Tensor, coc_px: Tensor, edges: DepthEdges, ops: Ops = EAGER) -
             return coc_px
     given = coc_px.detach()
     repaired = repair(image, given, STEP_PX, auto=edges == "auto", of_coc=True, ops=ops)
+    repaired = completed(image, repaired, ops)
     if repaired is given:
         return coc_px
     repaired = ops.equal_unless(lambda: _has_steps(coc_px), repaired, coc_px)

@@ -1,0 +1,440 @@
+// Gives missed fine parts of blurred foregrounds to them: the compiled version of torchdof/render/surfaces/missed.py.
+#include <algorithm>
+#include <cmath>
+#include <cstring>
+#include <utility>
+#include <vector>
+
+#include "api.h"
+#include "constants/missed.h"
+#include "entry.h"
+#include "memory.h"
+#include "simd.h"
+#include "threads.h"
+
+namespace torchdof {
+namespace {
+
+// Constants of render/surfaces/missed.py, which gives their meanings, units and effects.
+using constants::missed::RINGS_PX;
+constexpr int RIM = constants::missed::RIM;
+constexpr int SAMPLED = constants::missed::SAMPLED;
+constexpr int REACH = constants::missed::REACH;
+constexpr int CELL = constants::missed::CELL;
+constexpr int AROUND = constants::missed::AROUND;
+constexpr int PLACE = constants::missed::PLACE;
+constexpr float APART_PX = constants::missed::APART_PX;
+constexpr float APART = constants::missed::APART;
+constexpr float GRAIN = constants::missed::GRAIN;
+constexpr float OUTLIER = constants::missed::OUTLIER;
+constexpr float UNLIKE = constants::missed::UNLIKE;
+constexpr float MOST_UNLIKE = constants::missed::MOST_UNLIKE;
+constexpr float TAKEN = constants::missed::TAKEN;
+constexpr float MISSED = constants::missed::MISSED;
+constexpr float COUNTED = constants::missed::COUNTED;
+constexpr float COMPARED = constants::missed::COMPARED;
+constexpr float ON_SURFACE = constants::missed::ON_SURFACE;
+constexpr float LEAST_SAMPLES = constants::missed::LEAST_SAMPLES;
+constexpr float FAR_PX = constants::missed::FAR_PX;
+constexpr float LARGEST_PX = constants::missed::LARGEST_PX;
+constexpr float BRIGHTEST = constants::missed::BRIGHTEST;
+
+constexpr int TILE = 64;                 // px; side of the squares that a thread processes at once
+constexpr int MARGIN = 16;               // px around it in which rings are found, too
+constexpr int SIDE = TILE + 2 * MARGIN;  // px; side of a window
+constexpr int PITCH = SIDE + 2 * LANES;  // of a window; its columns begin at LANES
+constexpr int WINDOW = SIDE * PITCH;
+constexpr int CELLS = TILE / CELL;  // along a side of a tile
+constexpr int RINGS = sizeof(RINGS_PX) / sizeof(RINGS_PX[0]);
+constexpr int COUNTS = 4;  // planes: unlike pixels and all pixels, of the rim and of the background
+static_assert(TILE % CELL == 0 && TILE % LANES == 0 && MARGIN % LANES == 0 && MARGIN >= RINGS_PX[RINGS - 1], "");
+
+// Whether a surface is nearer than, and more blurred than, a pixel of this coc.
+ivec is_nearer(vec near, vec coc) {
+  const vec apart = APART_PX + APART * abs(near);
+  return (coc - near > apart) & (abs(near) - abs(coc) > apart);
+}
+
+bool is_valid(float coc) { return std::fabs(coc) <= LARGEST_PX; }
+
+// Means over windows of 2 * reach + 1 cells in planes of sums, of which cells beyond the frame are 0.
+class Around {
+ public:
+  Around(const torchdof_map &map, int rows, int columns) : map_(map), rows_(rows), columns_(columns) {}
+
+  void operator()(std::vector<float> &planes, int reach) const {
+    const size_t cells = (size_t)rows_ * columns_;
+    parallel(map_.threads, (int)(planes.size() / cells), map_.cancelled,
+             [&](int k, int) { mean(&planes[k * cells], reach); });
+  }
+
+ private:
+  void mean(float *plane, int reach) const {
+    const int side = 2 * reach + 1;
+    const float per = 1.0f / (float)(CELL * CELL * side * side);
+    std::vector<float> columns((size_t)rows_ * columns_), row(columns_ + 2 * reach);
+    for (int y = 0; y < rows_; y++)
+      for (int v = std::max(y - reach, 0); v <= std::min(y + reach, rows_ - 1); v++)
+        for (int x = 0; x < columns_; x++) columns[(size_t)y * columns_ + x] += plane[(size_t)v * columns_ + x];
+    for (int y = 0; y < rows_; y++) {
+      memcpy(&row[reach], &columns[(size_t)y * columns_], columns_ * sizeof(float));
+      float *const to = plane + (size_t)y * columns_;
+      std::fill_n(to, columns_, 0.0f);
+      for (int u = 0; u < side; u++)
+        for (int x = 0; x < columns_; x++) to[x] += row[x + u];
+      for (int x = 0; x < columns_; x++) to[x] *= per;
+    }
+  }
+
+  const torchdof_map &map_;
+  const int rows_, columns_;
+};
+
+class Missed {
+ public:
+  explicit Missed(const torchdof_map &map)
+      : map_(map), height_(map.height), width_(map.width), channels_(map.channels), area_((size_t)height_ * width_),
+        across_((width_ + TILE - 1) / TILE), down_((height_ + TILE - 1) / TILE), pitch_(across_ * TILE),
+        rows_((height_ + CELL - 1) / CELL), columns_((width_ + CELL - 1) / CELL), cells_((size_t)rows_ * columns_),
+        around_(map, rows_, columns_), plane_((size_t)pitch_ * height_), ring_(plane_), near_(plane_), coc_(plane_),
+        roots_(channels_ * plane_) {}
+
+  // Returns whether the map has changed; out is written only then.
+  bool run() {
+    find_rings();
+    if (tiles_.empty()) return false;
+    std::vector<float> means = background({});
+    around_(means, AROUND);
+    means = background(means);
+    around_(means, AROUND);
+    std::vector<float> counts = count(means);
+    around_(counts, PLACE);
+    return take(means, counts);
+  }
+
+ private:
+  // The background around the pixels of a row of cells, which share it cell by cell.
+  struct Background {
+    explicit Background(int channels) : mean((size_t)channels * TILE) {}
+    std::vector<float> mean;  // of the square root of light, channel by channel
+    float per_variance[TILE], coc[TILE], spread[TILE], seen[TILE];
+  };
+
+  template <typename Body>
+  void each_tile(const Body &body) {
+    parallel(map_.threads, (int)tiles_.size(), map_.cancelled, [&](int k, int) { body(tiles_[k]); });
+  }
+
+  // Calls visit(j, index) for vectors of pixels with rings in every `step`-th row of a tile, prepare(row of cells)
+  // before each row of cells with such pixels, and end(row of cells) after it.
+  template <typename Prepare, typename Visit, typename End>
+  void each_vector(int tile, int step, const Prepare &prepare, const Visit &visit, const End &end) const {
+    const int y0 = tile / across_ * TILE, y1 = std::min(y0 + TILE, height_);
+    for (int from = y0; from < y1; from += CELL) {
+      bool found = false;
+      for (int y = from; y < std::min(from + CELL, y1); y += step)
+        for (int j = 0; j < TILE; j += LANES) {
+          const size_t at = (size_t)y * pitch_ + tile % across_ * TILE + j;
+          if (!any_positive(load<vec>(&ring_[at]))) continue;
+          if (!found) prepare(from / CELL);
+          found = true;
+          visit(j, at);
+        }
+      if (found) end(from / CELL);
+    }
+  }
+
+  // Step 1: `ring_`, `near_`, and the tiles with rings.
+  void find_rings() {
+    std::vector<uint8_t> has(across_ * down_);
+    parallel(map_.threads, across_ * down_, map_.cancelled, [&](int tile, int) { has[tile] = rings_of(tile); });
+    for (int tile = 0; tile < across_ * down_; tile++)
+      if (has[tile]) tiles_.push_back(tile);
+  }
+
+  bool rings_of(int tile) const {
+    alignas(32) float coc[WINDOW], near[WINDOW], lowest[WINDOW], ring[WINDOW];
+    const int y0 = tile / across_ * TILE, x0 = tile % across_ * TILE, rows = std::min(TILE, height_ - y0);
+    std::fill_n(coc, WINDOW, FAR_PX);
+    const int from_x = std::max(x0 - MARGIN, 0), to_x = std::min(x0 + TILE + MARGIN, width_);
+    for (int y = std::max(y0 - MARGIN, 0); y < std::min(y0 + TILE + MARGIN, height_); y++)
+      memcpy(coc + (y - y0 + MARGIN) * PITCH + LANES + from_x - x0 + MARGIN,
+             map_.nearness + (size_t)y * width_ + from_x, (to_x - from_x) * sizeof(float));
+    vec low = broadcast(FAR_PX), high = -low;
+    for (int at = 0; at < WINDOW; at += LANES) {
+      const vec value = load<vec>(coc + at);
+      const ivec valid = abs(value) <= LARGEST_PX;
+      store(coc + at, valid ? value : broadcast(FAR_PX));
+      low = min(low, load<vec>(coc + at)), high = max(high, valid ? value : broadcast(-FAR_PX));
+    }
+    for (int i = 0; i < rows; i++) std::fill_n(&ring_[(size_t)(y0 + i) * pitch_ + x0], TILE, 0.0f);
+    if (!(reduce_max(high) - reduce_min(low) > APART_PX)) return false;
+    std::fill_n(near, WINDOW, FAR_PX);
+    std::fill_n(ring, WINDOW, 0.0f);
+    bool found = false;
+    for (int k = 0; k < RINGS; k++) {
+      const int end = RINGS_PX[k], reach = k == 0 ? end : end - RINGS_PX[k - 1];
+      const float *const from = k == 0 ? coc : near;
+      for (int i = end - reach; i < SIDE - end + reach; i++)
+        for (int at = i * PITCH + LANES; at < (i + 1) * PITCH - LANES; at += LANES) {
+          vec least = load<vec>(from + at);
+          for (int u = 1; u <= reach; u++) least = min(min(least, load<vec>(from + at - u)), load<vec>(from + at + u));
+          store(lowest + at, least);
+        }
+      bool is_any_new = false;
+      for (int i = end; i < SIDE - end; i++)
+        for (int at = i * PITCH + LANES; at < (i + 1) * PITCH - LANES; at += LANES) {
+          const vec c = load<vec>(coc + at), was = load<vec>(near + at);
+          vec least = load<vec>(lowest + at);
+          for (int v = PITCH; v <= reach * PITCH; v += PITCH)
+            least = min(min(least, load<vec>(lowest + at - v)), load<vec>(lowest + at + v));
+          const ivec is_new = (was == FAR_PX) & (c < FAR_PX) & is_nearer(least, c);
+          if (!any_of(is_new)) continue;
+          is_any_new = true;
+          store(near + at, is_new ? least : was);
+          store(ring + at, is_new ? broadcast(k + 1) : load<vec>(ring + at));
+        }
+      if (!is_any_new) break;
+      found = true;
+    }
+    for (int i = 0; found && i < rows; i++) {
+      const int at = (MARGIN + i) * PITCH + LANES + MARGIN;
+      const size_t to = (size_t)(y0 + i) * pitch_ + x0;
+      memcpy(&ring_[to], ring + at, TILE * sizeof(float));
+      memcpy(&near_[to], near + at, TILE * sizeof(float));
+    }
+    return found;
+  }
+
+  // Stores coc and square roots of light of every `step`-th row of a row of cells of a tile.
+  void read(int tile, int of_cells, int step) const {
+    const int x0 = tile % across_ * TILE, count = std::min(TILE, width_ - x0);
+    for (int y = of_cells * CELL; y < std::min((of_cells + 1) * CELL, height_); y += step) {
+      const size_t from = (size_t)y * width_ + x0, to = (size_t)y * pitch_ + x0;
+      for (int j = 0; j < count; j++) coc_[to + j] = ring_[to + j] > 0 ? map_.nearness[from + j] : 0.0f;
+      std::fill(&coc_[to] + count, &coc_[to] + TILE, 0.0f);
+      for (int c = 0; c < channels_; c++) {
+        const float *const light = map_.light + c * area_ + from;
+        float *const roots = &roots_[c * plane_ + to];
+        for (int j = 0; j < count; j++) {
+          const float known = (light[j] > 0) & (light[j] < INFINITY) ? light[j] : 0.0f;
+          roots[j] = std::sqrt(std::min(known, BRIGHTEST));
+        }
+        std::fill(roots + count, roots + TILE, 0.0f);
+      }
+    }
+  }
+
+  Background background_of(const std::vector<float> &means, int tile, int y) const {
+    Background of(channels_);
+    for (int k = 0; k < std::min(CELLS, columns_ - tile % across_ * CELLS); k++) {
+      const auto put = [&](float *to, float value) { std::fill_n(to + k * CELL, CELL, value); };
+      const float *const cell = &means[(size_t)y * columns_ + tile % across_ * CELLS + k];
+      const float per = 1.0f / std::max(cell[0], 1e-9f), per_channel = 1.0f / (float)channels_;
+      float bright = 0;
+      for (int c = 0; c < channels_; c++) {
+        const float mean = cell[(1 + c) * cells_] * per;
+        put(&of.mean[c * TILE], mean), bright += per_channel * mean * mean;
+      }
+      const float variance = std::max(cell[(1 + channels_) * cells_] * per - bright, 0.0f) + GRAIN * bright + 1e-12f;
+      const float coc = cell[(2 + channels_) * cells_] * per, square = cell[(3 + channels_) * cells_] * per;
+      put(of.seen, cell[0]), put(of.per_variance, per_channel / variance);
+      put(of.coc, coc), put(of.spread, std::sqrt(std::max(square - coc * coc, 0.0f)));
+    }
+    return of;
+  }
+
+  // Squared deviation of pixels from the background, over its variance.
+  vec deviation(size_t at, const Background &of, int j) const {
+    vec off{};
+    for (int c = 0; c < channels_; c++) {
+      const vec apart = load<vec>(&roots_[c * plane_ + at]) - load<vec>(&of.mean[c * TILE + j]);
+      off += apart * apart;
+    }
+    return off * load<vec>(of.per_variance + j);
+  }
+
+  // Where the background around pixels is one surface, which continues theirs.
+  ivec known(size_t at, const Background &of, int j) const {
+    const vec coc = load<vec>(&coc_[at]), apart = load<vec>(of.spread + j) + abs(load<vec>(of.coc + j) - coc);
+    return (load<vec>(&ring_[at]) > vec{}) & (load<vec>(of.seen + j) > LEAST_SAMPLES) &
+           (apart < ON_SURFACE * (coc - load<vec>(&near_[at])));
+  }
+
+  // Adds up sums of pixels of a row of cells, plane by plane, in the cells of planes of the frame.
+  void add_cells(std::vector<float> &sums, int tile, int y, float *planes) const {
+    for (size_t plane = 0; plane < sums.size() / cells_; plane++, planes += TILE)
+      for (int k = 0; k < std::min(CELLS, columns_ - tile % across_ * CELLS); k++) {
+        const float *const pixels = planes + k * CELL;
+        float sum = 0;
+        for (int j = 0; j < CELL; j++) sum += pixels[j];
+        sums[plane * cells_ + (size_t)y * columns_ + tile % across_ * CELLS + k] = sum;
+      }
+  }
+
+  // Step 2: sums of the samples of each cell: their weight, light, its square, coc and its square. With the means of a
+  // first pass, samples far from them get less weight.
+  std::vector<float> background(const std::vector<float> &means) {
+    const int planes = channels_ + 4;
+    const bool is_second = !means.empty();
+    std::vector<float> sums(planes * cells_);
+    each_tile([&](int tile) {
+      Background of(channels_);
+      std::vector<float> added(planes * TILE);
+      each_vector(
+          tile, SAMPLED,
+          [&](int y) {
+            std::fill(added.begin(), added.end(), 0.0f);
+            if (is_second)
+              of = background_of(means, tile, y);
+            else
+              read(tile, y, SAMPLED);
+          },
+          [&](int j, size_t at) {
+            vec weight = load<vec>(&ring_[at]) > (float)RIM ? broadcast(1.0f) : vec{}, square{};
+            if (!any_positive(weight)) return;
+            if (is_second) {
+              const vec outlier = 1.0f + deviation(at, of, j) * (1.0f / OUTLIER);
+              weight /= outlier * outlier;
+            }
+            const auto add = [&](int plane, vec value) {
+              float *const to = &added[plane * TILE + j];
+              store(to, load<vec>(to) + value);
+            };
+            for (int c = 0; c < channels_; c++) {
+              const vec root = load<vec>(&roots_[c * plane_ + at]);
+              square += root * root;
+              add(1 + c, weight * root);
+            }
+            const vec coc = load<vec>(&coc_[at]);
+            add(0, weight), add(1 + channels_, weight * square * (1.0f / (float)channels_));
+            add(2 + channels_, weight * coc), add(3 + channels_, weight * coc * coc);
+          },
+          [&](int y) { add_cells(sums, tile, y, added.data()); });
+    });
+    return sums;
+  }
+
+  // Steps 3 and 4: sums of the counts of each cell.
+  std::vector<float> count(const std::vector<float> &means) {
+    std::vector<float> sums(COUNTS * cells_);
+    each_tile([&](int tile) {
+      Background of(channels_);
+      float added[COUNTS * TILE];
+      each_vector(
+          tile, SAMPLED,
+          [&](int y) {
+            std::fill_n(added, COUNTS * TILE, 0.0f);
+            of = background_of(means, tile, y);
+          },
+          [&](int j, size_t at) {
+            const vec ring = load<vec>(&ring_[at]);
+            const vec capped = min(deviation(at, of, j) * (1.0f / UNLIKE), broadcast(MOST_UNLIKE));
+            const vec odds = capped * capped, unlike = odds / (1.0f + odds);
+            const auto add = [&](int plane, ivec chosen, vec value) {
+              float *const to = added + plane * TILE + j;
+              store(to, load<vec>(to) + (chosen ? value : vec{}));
+            };
+            const ivec compared = known(at, of, j), inner = compared & (ring > 1.0f) & (ring <= (float)RIM);
+            const ivec outer = compared & (ring == (float)RINGS);
+            add(0, inner, unlike), add(1, inner, broadcast(1.0f));
+            add(2, outer, unlike), add(3, outer, broadcast(1.0f));
+          },
+          [&](int y) { add_cells(sums, tile, y, added); });
+    });
+    return sums;
+  }
+
+  bool has_missed(const std::vector<float> &counts, size_t cell) const {
+    const float found = counts[cell], all = counts[cells_ + cell], compared = counts[3 * cells_ + cell];
+    const float usual = counts[2 * cells_ + cell] / std::max(compared, 1e-9f);
+    const float excess = (found / std::max(all, 1e-9f) - usual) / std::max(1.0f - usual, 0.1f);
+    const float side = CELL * (2 * PLACE + 1), pixels = all * side * side;
+    return compared > COMPARED * all && excess * std::min(pixels * (1.0f / COUNTED), 1.0f) > MISSED;
+  }
+
+  // Step 5: pixels that may be given to the near surface. `ring_` becomes 1 for them, 0 for others.
+  std::vector<std::pair<int, int>> unlike_pixels(const std::vector<float> &means, const std::vector<uint8_t> &missed) {
+    each_tile([&](int tile) {
+      Background of(channels_);
+      const auto prepare = [&](int y) {
+        read(tile, y, 1);
+        of = background_of(means, tile, y);
+      };
+      const auto mark = [&](int j, size_t at) {
+        const ivec may = known(at, of, j) & (deviation(at, of, j) > TAKEN);
+        store(&ring_[at], may ? broadcast(1.0f) : vec{});
+        for (int k = 0; k < LANES; k++) {
+          const size_t y = at / pitch_, x = at % pitch_ + k;
+          if (may[k] && !missed[y / CELL * columns_ + x / CELL]) ring_[at + k] = 0;
+        }
+      };
+      each_vector(tile, 1, prepare, mark, [](int) {});
+    });
+    std::vector<std::pair<int, int>> pixels;
+    for (int y = 0; y < height_; y++)
+      for (int x = 0; x < width_; x++)
+        if (ring_[(size_t)y * pitch_ + x] > 0) pixels.push_back({y, x});
+    return pixels;
+  }
+
+  // The rest of step 5. Few pixels are taken, so that lists of them are processed.
+  bool take(const std::vector<float> &means, const std::vector<float> &counts) {
+    std::vector<uint8_t> missed(cells_);
+    for (size_t cell = 0; cell < cells_; cell++) missed[cell] = has_missed(counts, cell);
+    if (std::none_of(missed.begin(), missed.end(), [](uint8_t has) { return has; })) return false;
+    std::vector<std::pair<int, int>> wanted = unlike_pixels(means, missed), taken;
+    if (wanted.empty()) return false;
+    memcpy(map_.out, map_.nearness, area_ * sizeof(float));
+    bool changed = false;
+    for (int round = 0; round < REACH && !wanted.empty(); round++) {
+      taken.clear();
+      for (const auto &[y, x] : wanted) {
+        float nearest = FAR_PX;
+        each_beside(y, x, [&](int v, int u) {
+          const float coc = map_.out[(size_t)v * width_ + u];
+          if (is_valid(coc)) nearest = std::min(nearest, coc);
+        });
+        const float coc = map_.out[(size_t)y * width_ + x];
+        float &may = ring_[(size_t)y * pitch_ + x];
+        if (may == 0 || !any_of(is_nearer(broadcast(nearest), broadcast(coc)))) continue;
+        may = 0;
+        near_[(size_t)y * pitch_ + x] = nearest;
+        taken.push_back({y, x});
+      }
+      wanted.clear();
+      for (const auto &[y, x] : taken) map_.out[(size_t)y * width_ + x] = near_[(size_t)y * pitch_ + x];
+      for (const auto &[y, x] : taken)
+        each_beside(y, x, [&](int v, int u) {
+          if (ring_[(size_t)v * pitch_ + u] != 0) wanted.push_back({v, u});
+        });
+      changed |= !taken.empty();
+    }
+    return changed;
+  }
+
+  template <typename Visit>
+  void each_beside(int y, int x, const Visit &visit) const {
+    for (int v = std::max(y - 1, 0); v <= std::min(y + 1, height_ - 1); v++)
+      for (int u = std::max(x - 1, 0); u <= std::min(x + 1, width_ - 1); u++) visit(v, u);
+  }
+
+  const torchdof_map &map_;
+  const int height_, width_, channels_;
+  const size_t area_;
+  const int across_, down_, pitch_;  // tiles along both axes, pixels of whole tiles
+  const int rows_, columns_;         // of cells
+  const size_t cells_;
+  const Around around_;
+  const size_t plane_;         // pixels of an image whose rows are pitch_ long
+  Buffer<float> ring_, near_;  // of each pixel; 0 without. The coc of its near surface.
+  Buffer<float> coc_, roots_;  // of pixels of rings; square roots of light, channel by channel
+  std::vector<int> tiles_;     // with rings
+};
+
+}  // namespace
+}  // namespace torchdof
+
+int32_t torchdof_missed_parts(const torchdof_map *map, int32_t *changed) {
+  return torchdof::guarded([&] { *changed = torchdof::Missed(*map).run(); });
+}

@@ -1,0 +1,166 @@
+"""Gives fine parts of a blurred foreground to it that the map of depth misses: hair, fur, twigs.
+
+A map often ends some pixels before the last hairs of its foreground. Left with the background they would stay sharp,
+before a smooth background the most visible fault of all. This module compares the pixels beside a more blurred near
+surface with the background farther from it. Where many of those near the edge are unlike the background and few of
+those farther away are, the map has missed parts of the near surface: unlike pixels connected to it get its coc.
+A map with exact edges stays unchanged, as things of the background do not prefer places beside the edge. Cells of
+pixels are counted from the top left, so that a few pixels of a mirrored frame may be decided otherwise.
+"""
+
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+from ... import native
+from ...tensors import is_in_memory, is_traced
+from ..engines.ops import EAGER, Ops
+from ..engines.traced import is_compiled, one_operator
+from ..rules import active
+
+__all__ = ["completed"]
+
+_APART_PX = 2.0  # px; smallest difference in coc, and in blur, of a near surface; larger: fewer edges
+_APART = 0.3  # added to it, over the blur of the near surface; larger: a foreground that slopes has no edges within
+_RINGS_PX = (1, 2, 3, 7, 14)  # px; distance from the near surface at which each ring ends
+_RIM = 3  # rings in which the map may have missed something; the first is mixed by the image itself
+_SAMPLED = 2  # rows; every so many are compared; larger: faster, coarser
+_REACH = 10  # px; farthest part that is given to the near surface; larger: longer hairs
+_CELL = 4  # px; side of the cells in which pixels are summed
+_AROUND = 2  # cells; half the width of the window of the background around a pixel; larger: smoother backgrounds
+_PLACE = 12  # cells; half the width of the window in which pixels are counted; larger: fewer wrong places
+_GRAIN = 4e-4  # least variance of the square root of light, over its square; larger: fewer pixels are unlike
+_OUTLIER = 9.0  # squared deviation at which a sample of the background counts by a quarter
+_UNLIKE = 9.0  # squared deviation at which a pixel counts by half as unlike the background
+_MOST_UNLIKE = 1e3  # largest deviation that is compared with `_UNLIKE`, whose square is finite
+_TAKEN = 2.25  # the same from which a pixel is given to the near surface, where the map has missed parts
+_MISSED = 0.25  # share of unlike pixels, above that of the background, from which the map has missed parts
+_COUNTED = 200.0  # sampled pixels of a rim from which the share counts in full; larger: fewer wrong places
+_COMPARED = 0.2  # fewest background pixels, over those of the rim
+_ON_SURFACE = 0.25  # deviation of the coc of samples, over the difference of both surfaces, up to which they are one
+_LEAST_SAMPLES = 0.005  # fraction of the window that samples fill
+_FAR_PX = 1e9  # px; a coc that marks pixels without a near surface
+_LARGEST_PX = 1e6  # px; largest valid coc, whose square is exact enough
+_BRIGHTEST = 1e15  # largest light that is compared
+
+
+def completed(image: Tensor, coc_px: Tensor, ops: Ops = EAGER) -> Tensor:
+    """Gives missed fine parts of blurred foregrounds the coc of the foreground.
+
+    1. Rings around a near surface: the pixels of a less blurred one across an edge, by their distance from it.
+    2. The background around each pixel: mean and variance of the square root of light in the outer two rings. A second
+       pass gives less weight to pixels that are far from the first mean.
+    3. A pixel's squared deviation ``z^2`` from that mean, over the variance; it is unlike the background by
+       ``z^4 / (z^4 + 81)``.
+    4. The map has missed parts where the mean of this in the second and third ring exceeds that in the last one:
+       ``(inner - outer) / (1 - outer) >`` :data:`_MISSED`.
+    5. There, pixels with ``z^2 >`` :data:`_TAKEN` that touch the near surface, or one another, get its coc.
+
+    Args:
+        image: ``[B, C, H, W]``, linear light; its scale does not matter.
+        coc_px: ``[B or 1, 1, H, W]``, signed, with repaired edges. Invalid values stay and affect no other pixel.
+        ops: Skips frames without such edges.
+
+    Returns:
+        The map; gradients flow to unchanged pixels.
+    """
+    if not active().missed_parts:
+        return coc_px
+    given, light = coc_px.detach().float().expand(image.shape[0], -1, -1, -1), image.detach().float()
+    if is_compiled():
+        near_px = _operator(light, given)
+    elif not is_traced() and all(map(is_in_memory, (image, coc_px))) and native.chosen():
+        maps = [of_item[0] for of_item in given]
+        items = [native.missed_parts(a, b) for a, b in zip(light, maps, strict=True)]
+        if all(new is old for new, old in zip(items, maps, strict=True)):
+            return coc_px
+        near_px = torch.stack(items)[:, None]
+    else:
+        near_px = _completed(light, given, ops)
+    return torch.where(near_px == given, coc_px, near_px.to(coc_px.dtype))
+
+
+@torch.no_grad()
+def _completed(image: Tensor, coc_px: Tensor, ops: Ops) -> Tensor:
+    """:func:`completed` by PyTorch, for float32."""
+    valid = coc_px.abs() <= _LARGEST_PX
+    coc = torch.where(valid, coc_px, _FAR_PX)
+
+    def is_nearer(near: Tensor) -> Tensor:
+        apart = _APART_PX + _APART * near.abs()
+        return valid & (coc - near > apart) & (near.abs() - coc.abs() > apart)
+
+    lowest = _lowest(coc, 1)
+    has_edges = is_nearer(lowest).any()
+    if not is_traced() and not has_edges:
+        return coc_px
+    near, ring = torch.full_like(coc, _FAR_PX), torch.zeros_like(coc)
+    for k in range(len(_RINGS_PX)):
+        if k > 0:
+            lowest = _lowest(near, _RINGS_PX[k] - _RINGS_PX[k - 1])
+        is_new = (ring == 0) & is_nearer(lowest)
+        near, ring = torch.where(is_new, lowest, near), torch.where(is_new, k + 1.0, ring)
+
+    light = torch.where(torch.isfinite(image), image, 0.0).clamp(0.0, _BRIGHTEST).sqrt()
+    is_sampled = (torch.arange(coc.shape[-2], device=coc.device) % _SAMPLED == 0)[:, None]
+    samples, on_surface = ((ring > _RIM) & is_sampled).to(coc.dtype), torch.where(ring > 0, coc, 0.0)
+    deviation = _compared(light, on_surface, samples)[0]
+    weight = samples / (1.0 + deviation / _OUTLIER).square()
+    deviation, middle, spread, seen = _compared(light, on_surface, weight)
+    is_one = spread.sqrt() + (middle - on_surface).abs() < _ON_SURFACE * (on_surface - near)
+    known = (ring > 0) & (seen > _LEAST_SAMPLES) & is_one
+    odds = (deviation / _UNLIKE).clamp(max=_MOST_UNLIKE).square()
+    unlike = odds / (1.0 + odds)
+    compared = known & is_sampled
+    parts = (compared & (ring > 1) & (ring <= _RIM), compared & (ring == len(_RINGS_PX)))
+    inner, outer = (torch.cat([part * unlike, part.to(unlike.dtype)], 1) for part in parts)
+    (found, count), (usual, of_usual) = (_around(t, _PLACE).split(1, 1) for t in (inner, outer))
+    usual = usual / of_usual.clamp_min(1e-9)
+    excess = (found / count.clamp_min(1e-9) - usual) / (1.0 - usual).clamp_min(0.1)
+    pixels = count * float((_CELL * (2 * _PLACE + 1)) ** 2)
+    excess = excess * (pixels / _COUNTED).clamp(max=1.0) * (of_usual > _COMPARED * count)
+    taken = known & (deviation > _TAKEN) & (_of_cells(excess, ring) > _MISSED)
+
+    out = coc
+    for _ in range(_REACH):
+        lowest = _lowest(out, 1)
+        out = torch.where(taken & (out == coc) & is_nearer(lowest), lowest, out)
+    return ops.equal_unless(lambda: has_edges, torch.where(valid, out, coc_px), coc_px)
+
+
+# What is computed depends on the data, which compiled graphs do not support.
+@one_operator("torchdof::missed_parts", lambda image, coc_px: coc_px.new_empty(coc_px.shape))
+def _operator(image: Tensor, coc_px: Tensor) -> Tensor:
+    return _completed(image, coc_px, EAGER).clone(memory_format=torch.contiguous_format)
+
+
+def _compared(light: Tensor, coc: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Squared deviation of each pixel from weighted samples around it, mean and variance of their coc, their weight."""
+    colours, square = light.shape[1], light.square().mean(1, keepdim=True)
+    sums = _around(weight * torch.cat([torch.ones_like(coc), light, square, coc, coc * coc], 1), _AROUND)
+    seen, means = sums.split([1, colours + 3], 1)
+    mean, square, middle, of_coc = (means / seen.clamp_min(1e-9)).split([colours, 1, 1, 1], 1)
+    bright = mean.square().mean(1, keepdim=True)
+    variance = (square - bright).clamp_min(0.0) + _GRAIN * bright + 1e-12
+    maps = torch.cat([mean, variance, middle, (of_coc - middle.square()).clamp_min(0.0), seen], 1)
+    mean, variance, middle, spread, seen = _of_cells(maps, light).split([colours, 1, 1, 1, 1], 1)
+    return (light - mean).square().mean(1, keepdim=True) / variance, middle, spread, seen
+
+
+def _around(values: Tensor, reach: int) -> Tensor:
+    """Means over windows of ``2 reach + 1`` cells, of which those beyond the frame are 0: ``[B, C, h, w]``."""
+    height, width = values.shape[-2:]
+    ends = (0, (width + _CELL - 1) // _CELL * _CELL - width, 0, (height + _CELL - 1) // _CELL * _CELL - height)
+    cells, side = functional.avg_pool2d(functional.pad(values, ends), _CELL), 2 * reach + 1
+    rows = functional.avg_pool2d(cells, (1, side), stride=1, padding=(0, reach))
+    return functional.avg_pool2d(rows, (side, 1), stride=1, padding=(reach, 0))
+
+
+def _of_cells(cells: Tensor, like: Tensor) -> Tensor:
+    """The value of each pixel's cell."""
+    pixels = functional.interpolate(cells, scale_factor=float(_CELL), mode="nearest")
+    return pixels[..., : like.shape[-2], : like.shape[-1]]
+
+
+def _lowest(values: Tensor, reach: int) -> Tensor:
+    return -functional.max_pool2d(-values, 2 * reach + 1, stride=1, padding=reach)
