@@ -1,6 +1,6 @@
 import importlib
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, settings
 
 from tests import exported, on_cpu
 from torchdof import native
-from torchdof.kernels import layers
+from torchdof.kernels import layers, loader, matting
 from torchdof.render.engines import on_gpu
 from torchdof.tensors import TRACEABLE
 
@@ -57,17 +57,21 @@ def launched(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
         pytest.skip("there is no C++ compiler")
     names: list[str] = []
 
-    def module(*variant: Any) -> layers.Launch:
-        launch = on_cpu.module(*variant)
+    def recording(module: Callable[..., loader.Launch]) -> Callable[..., loader.Launch]:
+        def with_record(*variant: Any) -> loader.Launch:
+            launch = module(*variant)
 
-        def recorded(kernel: str, *arguments: Any) -> None:
-            names.append(kernel)
-            launch(kernel, *arguments)
+            def recorded(kernel: str, *arguments: Any) -> None:
+                names.append(kernel)
+                launch(kernel, *arguments)
 
-        return recorded
+            return recorded
+
+        return with_record
 
     monkeypatch.setattr(on_gpu, "DEVICE", "cpu")
-    monkeypatch.setattr(layers, "module", module)
+    monkeypatch.setattr(layers, "module", recording(on_cpu.layers_module))
+    monkeypatch.setattr(matting, "module", recording(on_cpu.matting_module))
     monkeypatch.setenv("TORCHDOF_ENGINE", "gpu")
     for cached in (on_gpu.why_missing, on_gpu._warn):
         cached.cache_clear()

@@ -15,7 +15,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from torchdof.kernels import layers, loader
+from torchdof.kernels import layers, loader, matting
 
 ROOT = Path(__file__).parents[1]
 COMPILER = os.environ.get("CXX") or shutil.which("c++")
@@ -28,7 +28,7 @@ _BEFORE = """
 #define __launch_bounds__(threads)
 struct Index { int x, y, z; };
 static thread_local Index blockIdx, threadIdx;
-#include "layers.cu"
+#include SOURCE
 template <typename Kernel>
 static void launch(Kernel kernel, const Index &grid, const Index &block, const Run &run) {
   for (blockIdx.z = 0; blockIdx.z < grid.z; blockIdx.z++)
@@ -68,16 +68,16 @@ extern "C" int cuGetErrorString(int status, const char **text) {
 }
 """
 STREAM = 7  # the only one of this driver
-_OPTIONS = ("-std=c++17", "-O3", "-march=native", "-shared", "-fPIC", "-Wno-unknown-pragmas")
+_OPTIONS = ("-std=c++17", "-march=native", "-shared", "-fPIC", "-Wno-unknown-pragmas")
 
 
 @functools.cache
-def driver(channels: int, surfaces: int, stacked: bool) -> ctypes.CDLL:
-    """A driver with the kernels of :func:`torchdof.kernels.layers.module`, kept for the other processes of a run."""
-    source = (_SOURCES[0] / "layers.cu").read_text()
+def driver(name: str, *options: str) -> ctypes.CDLL:
+    """A driver with the kernels of a source and the compiler's options, kept for the other processes of a run."""
+    source = (_SOURCES[0] / name).read_text()
     kernels = re.findall(r'^extern "C" __global__ void (?:__launch_bounds__\(.*?\) )?(\w+)\(', source, re.MULTILINE)
     program = _BEFORE + _DRIVER % ", ".join(f'{{"{name}", {name}}}' for name in kernels)
-    given = [*_OPTIONS, *layers.options(channels, surfaces, stacked)]
+    given = [*_OPTIONS, f'-DSOURCE="{name}"', *options]
     headers = [file.read_text() for folder in _SOURCES for file in sorted(folder.glob("*.h"))]
     constants = (ROOT / "cmake" / "constants.py").read_text()
     key = hashlib.sha256("\0".join([source, program, *given, *headers, constants]).encode()).hexdigest()
@@ -97,6 +97,15 @@ def driver(channels: int, surfaces: int, stacked: bool) -> ctypes.CDLL:
     return ctypes.CDLL(str(library))
 
 
-def module(channels: int, surfaces: int, stacked: bool, device: int = 0) -> layers.Launch:
+def _module(name: str, *options: str) -> loader.Launch:
+    return loader.Module(driver(name, *options), b"program", lambda: contextlib.nullcontext(STREAM))
+
+
+def layers_module(channels: int, surfaces: int, stacked: bool, device: int = 0) -> loader.Launch:
     """As :func:`torchdof.kernels.layers.module`, with that driver."""
-    return loader.Module(driver(channels, surfaces, stacked), b"program", lambda: contextlib.nullcontext(STREAM))
+    return _module("layers.cu", "-O3", *layers.options(channels, surfaces, stacked))
+
+
+def matting_module(channels: int, device: int = 0) -> loader.Launch:
+    """As :func:`torchdof.kernels.matting.module`, with that driver."""
+    return _module("matting.cu", "-O1", *matting.options(channels))

@@ -12,13 +12,14 @@ import argparse
 import collections
 import contextlib
 import ctypes
+import functools
 import os
 import statistics
 import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from examples.benchmarks.steps import Counted, crops
 from torchdof import blur_by_coc, native
 from torchdof.functional import splat
-from torchdof.kernels import layers, loader
+from torchdof.kernels import layers, loader, matting
 from torchdof.render.engines import on_gpu
 
 HAS_DEVICE = torch.cuda.is_available()
@@ -43,6 +44,12 @@ CASES = [
     ((2160, 3840, 1), 16.0),
 ]
 """Height, width and number of pictures, and the largest radius of the blur."""
+
+LAYERS_OF_THE_MODEL = {
+    *("terms", "composite", "walk_back", "convolve_back", "terms_back", "stand_ins", "stand_ins_back"),
+    *("upsample", "upsample_back", "pass_back"),
+}
+"""Kernels that are not launched without a device: their time grows with the blur."""
 
 SMALL_CASES = [((96, 128, 1), 8.0), ((64, 96, 2), 4.0)]  # rendered on the CPU
 
@@ -87,24 +94,32 @@ class Launches:
         self.ms: dict[str, float] = collections.defaultdict(float)
 
     def __enter__(self) -> "Launches":
-        self._module = layers.module
-        layers.module = lambda *variant: self._counted(self._module(*variant), variant)  # type: ignore[assignment]
+        self._modules = layers.module, matting.module
+        of_layers, of_matting = self._modules
+
+        def counted_layers(*variant: Any) -> loader.Launch:
+            return self._counted(of_layers(*variant), functools.partial(cost, channels=variant[0], surfaces=variant[1]))
+
+        def counted_matting(*variant: Any) -> loader.Launch:
+            return self._counted(of_matting(*variant), functools.partial(cost_of_matting, channels=variant[0]))
+
+        layers.module, matting.module = counted_layers, counted_matting  # type: ignore[assignment]
         return self
 
     def __exit__(self, *_: Any) -> None:
-        layers.module = self._module
+        layers.module, matting.module = self._modules
 
-    def _counted(self, launch: layers.Launch, variant: Sequence[Any]) -> layers.Launch:
-        """A launch that is counted. Without a device only the tables of tiles are computed, which the model needs."""
+    def _counted(self, launch: loader.Launch, cost_of: Callable[..., tuple[float, float]]) -> loader.Launch:
+        """A launch that is counted. Without a device the layers are not computed, only their tables of tiles."""
 
         def counted(kernel: str, grid: Any, block: Any, argument: Any) -> None:
             self.count[kernel] += 1
             if HAS_DEVICE:
                 self.ms[kernel] += milliseconds(1, launch, kernel, grid, block, argument)
                 return
-            if kernel in ("mark", "find_lit", "find_read"):
+            if kernel not in LAYERS_OF_THE_MODEL:
                 launch(kernel, grid, block, argument)
-            moved, operations = cost(kernel, argument, grid[2], *variant[:2])
+            moved, operations = cost_of(kernel, argument, grid[2])
             self.bytes[kernel] += moved
             self.ms[kernel] += 1e3 * max(LAUNCH_S, moved / BYTES_PER_S, operations / FLOPS)
 
@@ -116,6 +131,37 @@ class Launches:
         print(f"{name}: {sum(self.count.values())} launches{what} {sum(self.ms.values()):.2f} ms")
         for kernel, count in sorted(self.count.items(), key=lambda item: -self.ms[item[0]]):
             print(f"  {kernel:15} {count:3} launches {self.ms[kernel]:8.3f} ms")
+
+
+def cost_of_matting(kernel: str, r: Any, items: int, channels: int) -> tuple[float, float]:
+    """As :func:`cost`, for the kernels of matting, after the launch."""
+    pixels, planes = r.height * r.width * items, 2 * channels + 2
+    of_pixel = {  # values of each pixel that are read or written
+        "find_edges": 2,
+        "find_clean": 2 * channels + 2,
+        "split": 2 * channels + 2 + planes,
+        "cover": 2 * planes + 2 * channels + 3,
+        "cover_back": 3 * planes + 4 * channels + 6,
+        "split_back": 2 * planes + 2,
+        "gather": 2 * r.planes + 2,
+        "find_clean_back": 3 * channels + 1,
+        "find_edges_back": 3 * channels + 2,
+        "sum_rows": channels + 1,
+    }
+    # of each pixel at an edge, and its floating-point operations
+    of_edge = {
+        "find_clean": (9 * (channels + 2), 9 * (10 + 2 * channels)),
+        "split": (9 * (2 * channels + 2), 9 * (60 + 50 * channels)),
+        "split_back": (27 * planes, 9 * (120 + 110 * channels)),
+        "gather": (9 * r.planes, 9 * r.planes),
+        "find_clean_back": (9 * (2 * channels + 4), 9 * (20 + 6 * channels)),
+        "find_edges_back": (18, 90),
+        "sum_rows": (2 * channels, 2 * channels),
+    }
+    edges = (ctypes.c_float * pixels).from_address(r.edge)
+    count = int((torch.frombuffer(edges, dtype=torch.float32) > 0).sum())
+    values, operations = of_edge.get(kernel, (0, 0))
+    return 4.0 * (of_pixel[kernel] * pixels + values * count), float(operations * count)
 
 
 def cost(kernel: str, r: Any, depth: int, channels: int, surfaces: int) -> tuple[float, float]:
@@ -180,8 +226,8 @@ def on_cpu() -> None:
     """Takes tensors on the CPU for those of a device, whose kernels are their C++ build."""
     from tests import on_cpu
 
-    on_gpu.DEVICE, layers.module = "cpu", on_cpu.module  # type: ignore[assignment]
-    native._library = lambda: (None, "switched off")  # as on a device: all but the layers by PyTorch, items together
+    on_gpu.DEVICE, layers.module, matting.module = "cpu", on_cpu.layers_module, on_cpu.matting_module  # type: ignore[assignment]
+    native._library = lambda: (None, "switched off")  # as on a device: all else by PyTorch, items together
 
 
 def scene(size: tuple[int, int, int], radius_px: float, focus: float = 0.4) -> tuple[str, Tensor, Tensor]:
@@ -215,7 +261,7 @@ def first_use() -> None:
     """Seconds until the first picture: compiled and tried, then with the kept program."""
     _, light, coc_px = scene(*SMALL_CASES[0])
     for name in ("without kernels", "kernels compiled", "the kept program"):
-        for cached in (layers.module, on_gpu.why_missing):
+        for cached in (layers.module, matting.module, on_gpu.why_missing):
             getattr(cached, "cache_clear", lambda: None)()
         start = time.perf_counter()
         with engine("torch" if name == "without kernels" else "gpu"):
@@ -251,7 +297,7 @@ def costs(ends: float) -> None:
                 print(f"{name}, a {kind}: {found[0]}; without kernels {found[1]}", flush=True)
             with Launches() as launches, Counted() as counted:
                 call(light, coc_px)
-            launches.show(f"{name}, layers of a {kind}")
+            launches.show(f"{name}, matting and layers of a {kind}")
             with engine("torch"), Counted() as plain:
                 call(light, coc_px)
             print(f"  {counted.operations} operations of PyTorch, without kernels {plain.operations}", flush=True)

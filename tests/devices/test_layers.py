@@ -11,7 +11,7 @@ from torch import Tensor
 
 from tests.scenes import CAMERA, CASES, Case, assert_same_picture, post_before_lamps, random_scene
 from torchdof import BlurTable, DepthOfField, blur_by_coc
-from torchdof.kernels import layers
+from torchdof.kernels import layers, loader, matting
 from torchdof.render import pipeline
 from torchdof.render.engines import on_gpu
 from torchdof.render.layers import composite
@@ -218,13 +218,15 @@ def test_float64_and_torch_func_take_the_plain_engine_and_autocast_the_kernels(l
 def test_without_kernels_there_is_one_warning_and_the_plain_engines_picture(
     launched: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def missing(*variant: Any) -> layers.Launch:
+    def missing(*variant: Any) -> loader.Launch:
         raise OSError("NVRTC of CUDA 12.8 was not found")
 
-    monkeypatch.setattr(layers, "module", missing)
+    for kernels in (layers, matting):
+        monkeypatch.setattr(kernels, "module", missing)
     monkeypatch.setenv("TORCHDOF_ENGINE", "auto")
-    with pytest.warns(RuntimeWarning, match="slower: NVRTC of CUDA 12.8 was not found"):
+    with pytest.warns(RuntimeWarning, match="slower: NVRTC of CUDA 12.8 was not found") as warned:
         found = rendered()
+    assert len(warned) == 1
     rendered(background=torch.rand(1, 3, 24, 30), background_coc_px=torch.full((1, 1, 24, 30), 20.0))  # no second one
     monkeypatch.setenv("TORCHDOF_ENGINE", "gpu")
     with pytest.raises(ValueError, match="TORCHDOF_ENGINE is gpu, but NVRTC of CUDA 12.8 was not found; leave it out"):
@@ -233,21 +235,27 @@ def test_without_kernels_there_is_one_warning_and_the_plain_engines_picture(
     assert_same_picture(rendered(), found, found)
 
 
-@pytest.mark.parametrize("wrong", ["composite", "convolve_back"])
+@pytest.mark.parametrize(
+    ("of", "wrong", "first"),
+    [
+        *((layers, wrong, "terms") for wrong in ("composite", "convolve_back")),
+        *((matting, wrong, "find_edges") for wrong in ("split", "gather")),
+    ],
+)
 def test_kernels_that_compute_something_else_are_not_used(
-    wrong: str, launched: list[str], monkeypatch: pytest.MonkeyPatch
+    of: Any, wrong: str, first: str, launched: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In the trial one kernel is not launched, as on a device on which it fails."""
-    right = layers.module
+    right = of.module
 
-    def module(*variant: Any) -> layers.Launch:
+    def module(*variant: Any) -> loader.Launch:
         launch = right(*variant)
         return lambda kernel, *arguments: None if kernel == wrong else launch(kernel, *arguments)
 
-    monkeypatch.setattr(layers, "module", module)
+    monkeypatch.setattr(of, "module", module)
     monkeypatch.setenv("TORCHDOF_ENGINE", "auto")
     with pytest.warns(RuntimeWarning, match="on this device they render another picture than PyTorch"):
         rendered()
     launched.clear()
     rendered()
-    assert not launched
+    assert launched and first not in launched

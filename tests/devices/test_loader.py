@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from tests import on_cpu
-from torchdof.kernels import layers, loader
+from torchdof.kernels import layers, loader, matting
 
 CUDA = "12.9"
 
@@ -27,26 +27,38 @@ def has_nvrtc() -> bool:
 
 
 NEEDS_NVRTC = pytest.mark.skipif(not has_nvrtc(), reason="NVRTC of CUDA 12 is not installed")
-VARIANTS = {"image": (3, 2, False), "largest": (layers.MOST_CHANNELS, layers.MOST_SURFACES, True)}
+VARIANTS = {
+    ("layers.cu", "image"): layers.options(3, 2, False),
+    ("layers.cu", "largest"): layers.options(layers.MOST_CHANNELS, layers.MOST_SURFACES, True),
+    ("matting.cu", "image"): matting.options(3),
+    ("matting.cu", "largest"): matting.options(matting.MOST_CHANNELS),
+}
+THREADS = {"composite": 128, "convolve_back": 128, "sum_rows": 32}  # of a block
 
 
 @NEEDS_NVRTC
 @pytest.mark.parametrize(
-    ("variant", "capability"), [*(("image", capability) for capability in (75, 80, 90, 120)), ("largest", 75)]
+    ("source", "variant", "capability"),
+    [
+        *(("layers.cu", "image", capability) for capability in (75, 80, 90, 120)),
+        ("layers.cu", "largest", 75),
+        *(("matting.cu", "image", capability) for capability in (75, 90, 120)),
+        ("matting.cu", "largest", 80),
+    ],
 )
-def test_kernels_compile_for_every_device_without_spills(variant: str, capability: int) -> None:
-    given = [*layers.options(*VARIANTS[variant]), "--ptxas-options=-v"]
-    image, log = loader.compile_program(loader.text("layers.cu"), given, capability, CUDA)
+def test_kernels_compile_for_every_device_without_spills(source: str, variant: str, capability: int) -> None:
+    text = loader.text(source)
+    image, log = loader.compile_program(text, [*VARIANTS[source, variant], "--ptxas-options=-v"], capability, CUDA)
     if not image.startswith(b"\x7fELF"):
         pytest.skip(f"this NVRTC does not know devices of compute capability {capability / 10}")
-    kernels = re.findall(r"(\w+)\(const __grid_constant__ Run r\)", loader.text("layers.cu"))
+    kernels = re.findall(r"(\w+)\(const __grid_constant__ Run r\)", text)
     compiled = re.findall(r"Compiling entry function '(\w+)'", log)
     assert sorted(compiled) == sorted(kernels)
     moved = re.findall(r"(\d+) bytes stack frame, (\d+) bytes spill stores, (\d+) bytes spill loads", log)
     assert moved == [("0", "0", "0")] * len(kernels), log
     registers = dict(zip(compiled, map(int, re.findall(r"Used (\d+) registers", log)), strict=True))
     for kernel, count in registers.items():  # of a block of threads
-        threads = 128 if kernel in ("composite", "convolve_back") else 512
+        threads = THREADS.get(kernel, 512 if source == "layers.cu" else 128)
         assert threads * count <= 65536, f"{kernel}: {count} registers"
 
 
@@ -120,7 +132,7 @@ def test_a_folder_that_cannot_be_written_is_no_error(compilations: list[str], tm
 def test_an_error_of_the_driver_is_an_error_that_names_it() -> None:
     if on_cpu.COMPILER is None:
         pytest.skip("there is no C++ compiler")
-    driver, argument = on_cpu.driver(3, 2, False), layers.argument_type(2)()
+    driver, argument = on_cpu.driver("layers.cu", "-O3", *layers.options(3, 2, False)), layers.argument_type(2)()
     launch = loader.Module(driver, b"program", lambda: contextlib.nullcontext(on_cpu.STREAM))
     with pytest.raises(RuntimeError, match="the CUDA driver reports 'named symbol not found', error 500"):
         launch("nowhere", (1, 1, 1), (32, 16, 1), argument)

@@ -34,7 +34,7 @@ def main(engine: str) -> None:
     """Checks the files, the command and a picture, and prints the version."""
     files = resources.files("torchdof")
     modules = ("py.typed", "fit/__init__.py", "export/__init__.py", "native/__init__.py", "native/api.h")
-    for name in (*modules, *(f"kernels/{source}" for source in ("layers.cu", *loader.HEADERS))):
+    for name in (*modules, *(f"kernels/{source}" for source in ("layers.cu", "matting.cu", *loader.HEADERS))):
         assert files.joinpath(name).is_file(), f"{name} is not installed"
     names = [str(path.relative_to(str(files))) for path in Path(str(files)).rglob("*")]
     for suffix in ("/sato_j15.json", "/double_gauss_50mm.txt"):

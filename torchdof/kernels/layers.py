@@ -6,14 +6,14 @@ each colour is an item of one channel, which shares its places and weights with 
 
 import ctypes
 import functools
-import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from . import loader
+from .loader import Launch, pointer
 
 MOST_CHANNELS, MOST_SURFACES, MOST_ITEMS = 8, 4, 4000
 
@@ -25,9 +25,6 @@ Surface = tuple[Tensor, Tensor, Tensor | None]
 """Light ``[B, C, H, W]``, place on the blur axis and weight (None: 1), ``[B, 1, H, W]``."""
 
 _MAPS = ("light", "place", "weight")  # of a surface
-
-Launch = Callable[[str, Sequence[int], Sequence[int], ctypes.Structure], None]
-"""``launch(kernel, grid, block, argument)``."""
 
 
 class Frame(NamedTuple):
@@ -95,13 +92,7 @@ def options(channels: int, surfaces: int, stacked: bool) -> list[str]:
 @functools.cache
 def argument_type(surfaces: int) -> type[ctypes.Structure]:
     """The structure that all kernels take, as ``frame.h`` defines it."""
-    body = re.search(r"struct Run {\n(.*?)\n};", loader.text("frame.h"), re.DOTALL)
-    assert body is not None
-    fields: list[tuple[str, Any]] = []
-    for kind, name, size in re.findall(r"^  (?:const )?([\w ]+ ?\*?)\b(\w+)(?:\[(\w+)\])?;", body[1], re.MULTILINE):
-        of_one: Any = ctypes.c_void_p if "*" in kind else ctypes.c_int
-        fields.append((name, of_one * {"SURFACES": surfaces, "LAYERS": _LAYERS}[size] if size else of_one))
-    return type("Run", (ctypes.Structure,), {"_fields_": fields})
+    return loader.structure(loader.text("frame.h"), {"SURFACES": surfaces, "LAYERS": _LAYERS})
 
 
 def steps_of(frame: Frame, items: int, values: int) -> list[Step]:
@@ -163,7 +154,7 @@ class Composite:
             backed=frame.backed,
         )
         for i, name in enumerate(_MAPS):
-            getattr(self._common, name)[:] = [_pointer(maps[i]) for maps in surfaces]
+            getattr(self._common, name)[:] = [pointer(maps[i]) for maps in surfaces]
 
     def picture(self, kept: list[Kept] | None = None) -> Tensor:
         """Light, then its weight of each colour, ``[B, C + E, h, w]``; ``kept`` collects what the gradients need."""
@@ -193,7 +184,7 @@ class Composite:
         Each group of layers is blurred again, so that only one group at a time takes memory for its blurred terms.
         """
         sums = [None if t is None else self._zeros_of_items(t) for maps in self._surfaces for t in maps]
-        pointers = {f"of_{name}": [_pointer(t) for t in sums[i::3]] for i, name in enumerate(_MAPS)}
+        pointers = {f"of_{name}": [pointer(t) for t in sums[i::3]] for i, name in enumerate(_MAPS)}
         if self._colours == 1:
             slopes = of_picture.clone(memory_format=torch.contiguous_format)
         else:
@@ -278,7 +269,7 @@ class Composite:
             if isinstance(value, list):
                 getattr(argument, name)[:] = value
             else:
-                setattr(argument, name, _pointer(value))
+                setattr(argument, name, pointer(value))
         return argument
 
     def _run(
@@ -295,10 +286,6 @@ class Composite:
     def _zeros_of_items(self, values: Tensor) -> Tensor:
         """Zeros for the gradient by a map of each item."""
         return values.new_zeros(self._items, -(-values.shape[1] // self._colours), *values.shape[-2:])
-
-
-def _pointer(values: Tensor | None) -> int | None:
-    return None if values is None else values.data_ptr()
 
 
 def _with_numbers(argument: Any, numbers: dict[str, int]) -> Any:

@@ -7,6 +7,7 @@ import glob
 import hashlib
 import importlib.resources
 import os
+import re
 import sys
 import sysconfig
 import tempfile
@@ -16,18 +17,45 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
-_CONSTANTS = ("composite", "disocclusion", "frame", "layer_weights")
-HEADERS = ("frame.h", "weights.h", "rules.h", "numbers.h", *(f"constants/{name}.h" for name in _CONSTANTS))
+_CONSTANTS = ("composite", "disocclusion", "frame", "layer_weights", "matting")
+HEADERS = (
+    *("frame.h", "weights.h", "matting.h", "split.h", "rules.h", "numbers.h"),
+    *(f"constants/{name}.h" for name in _CONSTANTS),
+)
 """Files beside this one that kernels include; the build installs those that the compiled engine includes too."""
 
 _NO_STANDARD_LIBRARY = {"cstdint": "typedef long long int64_t;\ntypedef unsigned int uint32_t;\n"}
 _OPTIONS = ("--std=c++17", "--device-as-default-execution-space")
 
 
+Launch = Callable[[str, Sequence[int], Sequence[int], ctypes.Structure], None]
+"""``launch(kernel, grid, block, argument)``."""
+
+
 def text(name: str) -> str:
     """Text of a source or a header."""
     return (importlib.resources.files(__package__) / name).read_text(encoding="utf-8")
+
+
+def structure(source: str, sizes: dict[str, int]) -> type[ctypes.Structure]:
+    """The structure ``Run`` of a source, one member a line: the argument of its kernels.
+
+    ``sizes`` are the lengths of its arrays, by their names.
+    """
+    body = re.search(r"struct Run {\n(.*?)\n};", source, re.DOTALL)
+    assert body is not None
+    fields: list[tuple[str, Any]] = []
+    for kind, name, size in re.findall(r"^  (?:const )?([\w ]+ ?\*?)\b(\w+)(?:\[(\w+)\])?;", body[1], re.MULTILINE):
+        of_one: Any = ctypes.c_void_p if "*" in kind else ctypes.c_int
+        fields.append((name, of_one * sizes[size] if size else of_one))
+    return type("Run", (ctypes.Structure,), {"_fields_": fields})
+
+
+def pointer(values: Tensor | None) -> int | None:
+    """The address of a tensor's memory, for a member of the structure; None for None."""
+    return None if values is None else values.data_ptr()
 
 
 def _candidates(version: str) -> Iterator[str]:
@@ -104,7 +132,7 @@ def compile_program(source: str, options: Sequence[str], capability: int, versio
     is_known = capability in usable
     target = f"--gpu-architecture={'sm' if is_known else 'compute'}_{capability if is_known else max(usable)}"
     texts, includes = (_strings(part) for part in (names.values(), names))
-    library.nvrtcCreateProgram(ctypes.byref(program), source.encode(), b"layers.cu", len(names), texts, includes)
+    library.nvrtcCreateProgram(ctypes.byref(program), source.encode(), b"kernels.cu", len(names), texts, includes)
     given = [target, *_OPTIONS, *options]
     failed = library.nvrtcCompileProgram(program, len(given), _strings(given))
 

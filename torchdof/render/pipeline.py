@@ -20,6 +20,7 @@ from ..validation import NAMED_TOLERANCES
 from . import exposure, highlights, routes, rules
 from .attention import Attention, box_around, weight_map
 from .engines import compiled
+from .engines.on_gpu import matte
 from .engines.ops import EAGER, Ops
 from .engines.traced import is_compiled
 from .layers import composite
@@ -31,7 +32,6 @@ from .surfaces import edges
 from .surfaces.coverage import covered_by
 from .surfaces.disocclusion import behind_pixels, surfaces_of_image
 from .surfaces.frame import PaddedFrame, Surface, pad_to_frame
-from .surfaces.matting import matte
 
 _REACH = 4.0  # margin around an attention area, in largest blur radii; less changes its light and hidden surfaces
 _TOGETHER = 2**21  # pixels of items rendered together; larger: fewer, larger operations, and more memory

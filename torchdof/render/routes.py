@@ -9,16 +9,18 @@
 | `attention` | compiled | steps | kernels | PyTorch | refused | no such input |
 | stack of up to 3 layers (`DepthOfField.layers`) | compiled | steps | kernels | PyTorch | left out | no such input |
 | stack of more layers | compiled | steps | PyTorch | PyTorch | left out | no such input |
-| a table whose blur depends on the place in the frame | compiled | steps | PyTorch | PyTorch | refused | refused |
-| `method="fold"` | steps | steps | PyTorch | PyTorch | graph | graph |
-| an aperture whose rotation or squeeze has a gradient | steps | steps | PyTorch | PyTorch | left out | refused |
+| a table whose blur depends on the place in the frame | compiled | steps | kernels | PyTorch | refused | refused |
+| `method="fold"` | steps | steps | kernels | PyTorch | graph | graph |
+| an aperture whose rotation or squeeze has a gradient | steps | steps | kernels | PyTorch | left out | refused |
 | kernels wider than 513 pixels of their layer | steps | steps | kernels | PyTorch | graph | graph |
 | `torchdof.functional.splat` | PyTorch | PyTorch | PyTorch | PyTorch | refused | no such input |
 
 - compiled: the compiled engine renders the whole picture. What a matte says is computed in PyTorch before.
 - steps: PyTorch renders, and the compiled engine computes those of its steps that it supports.
-- kernels: PyTorch renders, and CUDA kernels blur and composite the layers of float32, with and without gradients, of up
-  to 8 channels, or of any number of colours with kernels of their own (:mod:`torchdof.render.engines.on_gpu`).
+- kernels: PyTorch renders, and CUDA kernels compute those of its steps that they support, in float32, with and without
+  gradients (:mod:`torchdof.render.engines.on_gpu`). They split the mixed pixels of images of up to 8 channels, and blur
+  and composite layers of up to 8 channels, or of any number of colours with kernels of their own. With a table that
+  depends on the place, `method="fold"` or an aperture with a gradient, they split pixels alone.
 - otherwise: float64, or another device.
 - PyTorch: PyTorch renders alone. So it does where there is no compiled engine, or no NVRTC beside PyTorch for the
   kernels; with `TORCHDOF_ENGINE=torch`; and in forward mode or under `torch.func`.
@@ -37,7 +39,7 @@ import torch
 from torch import Tensor
 
 from .. import native
-from ..kernels import layers
+from ..kernels import layers, matting
 from ..options import Options
 from ..tensors import is_differentiated, is_traced
 from ..validation import engine_reads
@@ -192,21 +194,27 @@ def _of_eager(
 
 
 def _of_gpu(options: Options, maps: Sequence[Tensor], is_stack: bool) -> Route:
-    """As :func:`route`, for a device with kernels, as :func:`torchdof.render.engines.on_gpu.composited` decides."""
-    channels = 1 if options.table.channels > 1 else maps[0].shape[-3]
-    # a stack has a black surface behind it; a known background is behind the two surfaces of a pixel
-    surfaces = maps[0].shape[1] + 1 if is_stack else 3 if len(maps) > 2 else 2
+    """As :func:`route`, for a device with kernels, as :mod:`torchdof.render.engines.on_gpu` decides for each step."""
+    device, channels = maps[0].device.type, maps[0].shape[-3]
     for is_refused, why in (
         (native.wanted() == "torch", "as TORCHDOF_ENGINE says"),
         (any(t.dtype != torch.float32 for t in maps), "the kernels compute in float32, and a map is float64"),
         (not options.occlusion, "without occlusion"),
+        (not on_gpu.takes(maps, 1, 1), _NO_MEMORY),
+    ):
+        if is_refused:
+            return Route("PyTorch", f"on {device}, {why}")
+    # a stack has a black surface behind it; a known background is behind the two surfaces of a pixel
+    surfaces = maps[0].shape[1] + 1 if is_stack else 3 if len(maps) > 2 else 2
+    for has_no_kernels, why in (
         (options.method != "layered", f"method={options.method!r}"),
         (options.table.depends_on_place, "the blur depends on the place in the frame"),
         (options.table.is_differentiated, "the aperture's rotation or squeeze has a gradient"),
-        (channels > layers.MOST_CHANNELS, f"more than {layers.MOST_CHANNELS} channels"),
+        (options.table.channels == 1 and channels > layers.MOST_CHANNELS, f"more than {layers.MOST_CHANNELS} channels"),
         (surfaces > layers.MOST_SURFACES, f"a stack of more than {layers.MOST_SURFACES - 1} layers"),
-        (not on_gpu.takes(maps, channels, surfaces), _NO_MEMORY),
     ):
-        if is_refused:
-            return Route("PyTorch", f"on {maps[0].device.type}, {why}")
-    return Route("kernels", f"float32 on {maps[0].device.type}")
+        if has_no_kernels:
+            if is_stack or channels > matting.MOST_CHANNELS:
+                return Route("PyTorch", f"on {device}, {why}")
+            return Route("kernels", f"float32 on {device}; PyTorch blurs the layers: {why}")
+    return Route("kernels", f"float32 on {device}")

@@ -1,6 +1,6 @@
-"""The layers of a picture on a CUDA device, by the kernels of :mod:`torchdof.kernels`, forward and backward.
+"""Matting and layers on a CUDA device, by the kernels of :mod:`torchdof.kernels`, forward and backward.
 
-Before a device first renders with some kernels, they and the plain engine render a small frame. If the pictures or the
+Before a device first uses some kernels, they and the plain engine compute a small frame. If the results or the
 gradients differ, or if the kernels cannot be compiled, the plain engine is used from then on, with one warning that
 says why; ``TORCHDOF_ENGINE=gpu`` makes it an error.
 """
@@ -15,16 +15,19 @@ import torch
 from torch import Tensor
 
 from ... import native
-from ...kernels import layers
+from ...kernels import layers, matting
 from ...tensors import is_differentiated, is_in_memory, is_traced, without_autocast
 from ..layers.layer_weights import ramps
 from ..surfaces.frame import PaddedFrame, PaddedSurface, maps_of, surfaces_of
+from ..surfaces.matting import Matted
+from ..surfaces.matting import matte as plain_matte
 from .compiled_steps import differentiable
+from .ops import EAGER, Ops
 
 DEVICE = "cuda"
 """Type of the devices that have kernels."""
 
-_NEAR = 1e-5  # largest difference between the pictures of both engines, of the light
+_NEAR = 1e-5  # largest difference between the results of both engines, of the light
 _NEAR_GRADIENT = 1e-4  # the same of their gradients, of the norm
 
 Kernels = Sequence[tuple[Tensor, int]]
@@ -48,7 +51,28 @@ def composited(frame: PaddedFrame, kernels: Kernels, plain: Plain) -> Tensor | N
     if not takes(maps, channels, len(frame.surfaces)) or len(maps[0]) * colours > layers.MOST_ITEMS:
         return None
     variant = (channels, len(frame.surfaces), frame.stacked, maps[0].device.index or 0)
-    return None if _missing(plain, *variant) else _by_kernels(frame, kernels, plain)
+    return None if _missing(_layers_of_trial, plain, *variant) else _by_kernels(frame, kernels, plain)
+
+
+def matte(
+    light: Tensor,
+    coc_px: Tensor,
+    valid: Tensor | None = None,
+    ops: Ops = EAGER,
+    covered: Tensor | None = None,
+) -> Matted:
+    """:func:`torchdof.render.surfaces.matting.matte`, by kernels of a GPU if they compute it.
+
+    Raises:
+        ValueError: If they cannot be used and ``TORCHDOF_ENGINE`` is ``gpu``.
+    """
+    maps = [t for t in (light, coc_px, valid, covered) if t is not None]
+    # the number of items last, as in `composited`
+    if not takes(maps, light.shape[1], 2) or len(light) > matting.MOST_ITEMS:
+        return plain_matte(light, coc_px, valid, ops, covered)
+    if _missing(_matte_of_trial, light.shape[1], light.device.index or 0):
+        return plain_matte(light, coc_px, valid, ops, covered)
+    return Matted(*_matte_by_kernels(light, coc_px, valid, covered).split([light.shape[1], light.shape[1], 1, 1], 1))
 
 
 def takes(maps: Sequence[Tensor], channels: int, surfaces: int) -> bool:
@@ -60,9 +84,9 @@ def takes(maps: Sequence[Tensor], channels: int, surfaces: int) -> bool:
     return all(t.dtype == torch.float32 and is_in_memory(t, backward=True, device=DEVICE) for t in maps)
 
 
-def _missing(plain: Plain, *variant: Any) -> bool:
+def _missing(trial: "Trial", *variant: Any) -> bool:
     """Whether the kernels cannot be used, after a warning or an error that says why."""
-    reason = why_missing(plain, *variant)
+    reason = why_missing(trial, *variant)
     if reason and native.wanted() == "gpu":
         raise ValueError(f"TORCHDOF_ENGINE is gpu, but {reason}; leave it out to render with PyTorch")
     if reason:
@@ -72,32 +96,35 @@ def _missing(plain: Plain, *variant: Any) -> bool:
 
 @functools.cache
 def _warn(reason: str) -> None:
-    message = f"layers are rendered by PyTorch instead of CUDA kernels, which is slower: {reason}"
+    message = f"PyTorch computes what CUDA kernels would, which is slower: {reason}"
     warnings.warn(message, RuntimeWarning, stacklevel=2)
 
 
+Trial = Callable[..., tuple[Sequence[Tensor], Callable[..., Tensor], Callable[..., Tensor]]]
+"""``trial(*variant)``: maps of a small frame, then what the plain engine and the kernels make of them."""
+
+
 @functools.cache
-def why_missing(plain: Plain, channels: int, surfaces: int, stacked: bool, device: int) -> str:
-    """Why the kernels for these numbers of channels and surfaces cannot be used on a device; empty if they can."""
-    where = torch.device(DEVICE, device)
+def why_missing(trial: Trial, *variant: Any) -> str:
+    """Why the kernels of a variant, whose last value is the device, cannot be used; empty if they can."""
     try:
-        with torch.inference_mode(False), torch.enable_grad(), without_autocast(DEVICE):
-            frame, kernels = _trial(channels, surfaces, stacked, where)
+        with torch.inference_mode(False), torch.enable_grad(), without_autocast(DEVICE), native.engine_off():
+            maps, *engines = trial(*variant)
+            maps = [t.to(torch.device(DEVICE, variant[-1])).requires_grad_() for t in maps]
             results = []
-            for render in (plain, functools.partial(_by_kernels, plain=plain)):
-                picture = render(frame, kernels)
-                gradients = torch.autograd.grad(picture.square().sum(), maps_of(frame.surfaces))
-                results.append((picture.detach(), *gradients))
+            for compute in engines:
+                result = compute(*maps)
+                results.append((result.detach(), *torch.autograd.grad(result.square().sum(), maps)))
     except Exception as error:  # of any kind: the plain engine needs none of this
         return str(error) or type(error).__name__
-    (picture, *of_plain), (other, *of_kernels) = results
-    is_near = bool((other - picture).abs().max() <= _NEAR) and all(
+    (result, *of_plain), (other, *of_kernels) = results
+    is_near = bool((other - result).abs().max() <= _NEAR) and all(
         bool((b - a).norm() <= _NEAR_GRADIENT * a.norm()) for a, b in zip(of_plain, of_kernels, strict=True)
     )
     return "" if is_near else "on this device they render another picture than PyTorch"
 
 
-def _trial(channels: int, surfaces: int, stacked: bool, device: torch.device) -> tuple[PaddedFrame, Kernels]:
+def _layers_of_trial(plain: Plain, channels: int, surfaces: int, stacked: bool, device: int) -> Any:
     """A small frame of random light from 0 to 1, places and weights, and layers of two resolutions."""
     dice, nodes, (height, width), margin = torch.Generator().manual_seed(0), (-3.0, -1.0, 0.0, 1.0, 3.0), (20, 36), 8
 
@@ -106,17 +133,68 @@ def _trial(channels: int, surfaces: int, stacked: bool, device: torch.device) ->
 
     size = (height + 2 * margin, width + 2 * margin)
     maps = [
-        (random(1, channels, *size), 7.0 * random(1, 1, *size) - 3.5, random(1, 1, *size) / surfaces)
+        t
         for _ in range(surfaces)
+        for t in (random(1, channels, *size), 7.0 * random(1, 1, *size) - 3.5, random(1, 1, *size) / surfaces)
     ]
-    kernels = []
+    where, kernels = torch.device(DEVICE, device), []
     for half, scale in ((2, 2), (3, 1), (0, 1), (3, 1), (3, 2)):
         kernel = random(1, 2 * half + 1, 2 * half + 1)
-        kernels.append(((kernel / kernel.sum()).to(device), scale))
-    padded = [PaddedSurface(*(t.to(device).requires_grad_() for t in of_surface)) for of_surface in maps]
-    behind = None if stacked else random(1, channels, height, width).to(device)
-    starts, area = ramps([nodes], padded[0].x.detach()), (height, width)
-    return PaddedFrame(padded, [nodes], starts, behind, margin, area, area, True, stacked), kernels
+        kernels.append(((kernel / kernel.sum()).to(where), scale))
+    behind = None if stacked else random(1, channels, height, width).to(where)
+    starts, area = ramps([nodes], maps[0].to(where)), (height, width)
+
+    def with_maps(*maps: Tensor) -> PaddedFrame:
+        padded = [PaddedSurface(*maps[i : i + 3]) for i in range(0, len(maps), 3)]
+        return PaddedFrame(padded, [nodes], starts, behind, margin, area, area, True, stacked)
+
+    return (
+        maps,
+        lambda *maps: plain(with_maps(*maps), kernels),
+        lambda *maps: _by_kernels(with_maps(*maps), kernels, plain),
+    )
+
+
+def _matte_of_trial(channels: int, device: int) -> Any:
+    """A small image of patches, each with a random colour and coc, and noise."""
+    dice = torch.Generator().manual_seed(0)
+    light, coc_px = (torch.rand(1, n, 5, 7, generator=dice).repeat_interleave(4, 2) for n in (channels, 1))
+    light, coc_px = (t.repeat_interleave(4, 3) for t in (light, coc_px))
+    light = (light + 0.3 * torch.rand(light.shape, generator=dice)) / 1.3
+
+    def weighted(surfaces: Sequence[Tensor]) -> Tensor:
+        own, other, other_coc, weight = surfaces
+        return torch.cat([own, weight * other, weight * other_coc, weight], 1)  # the other light is moved / weight
+
+    return (
+        [light, 16.0 * coc_px - 8.0],
+        lambda *maps: weighted(plain_matte(*maps)),
+        lambda *maps: weighted(_matte_by_kernels(*maps).split([channels, channels, 1, 1], 1)),
+    )
+
+
+def _matte_by_kernels(
+    light: Tensor, coc_px: Tensor, valid: Tensor | None = None, covered: Tensor | None = None
+) -> Tensor:
+    """The surfaces of :func:`matte`, ``[B, 2 C + 2, H, W]``."""
+    constant = [] if valid is None else [valid]
+    varied = [light, coc_px, *([] if covered is None else [covered])]
+
+    def named(maps: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
+        maps = [t.contiguous() for t in maps]
+        return maps[0], maps[1], maps[-1] if constant else None, None if covered is None else maps[2]
+
+    def plain(*maps: Tensor) -> Tensor:
+        light, coc_px, valid, covered = named(maps)
+        return torch.cat(plain_matte(light, coc_px, valid, covered=covered), 1)
+
+    return differentiable(
+        lambda *maps: matting.Matting(*named(maps)).surfaces(),
+        lambda gradient, *maps: matting.Matting(*named(maps)).gradients(gradient),
+        plain,
+        *varied,
+        *constant,
+    )
 
 
 def _by_kernels(frame: PaddedFrame, kernels: Kernels, plain: Plain) -> Tensor:

@@ -16,13 +16,14 @@ from ... import native
 from ...optics.kernel_cache import kept
 from ...tensors import recomputed
 from ..engines.compiled_steps import compiled_step
+from ..engines.on_gpu import matte
 from ..engines.ops import EAGER, Level, Ops, Seen
 from ..engines.traced import is_compiled, one_operator
 from ..layers.downsampling import downsampled
 from ..rules import active
 from .emitters import attribute_emitters
 from .frame import HIDDEN_WEIGHT, Surface
-from .matting import NEVER_PX, Matted, matte
+from .matting import NEVER_PX, Matted
 
 # Another surface, or a slope of the pixel's own one; larger values of both: fewer hidden samples
 _BEHIND_PX = (

@@ -1,0 +1,129 @@
+"""Matting on a GPU: the host code of ``matting.cu``, whose comments have the steps.
+
+Tensors are float32, contiguous and on one device. ``B`` items have ``C`` channels.
+"""
+
+import ctypes
+import functools
+
+import torch
+from torch import Tensor
+
+from . import loader
+from .loader import Launch
+
+MOST_CHANNELS, MOST_ITEMS = 8, 4000
+
+_TILE_ROWS, _TILE_COLUMNS = 4, 32  # as in matting.h
+_TAPS = 9  # pixels around one, as in matting.h
+
+
+@functools.cache
+def module(channels: int, device: int) -> Launch:
+    """The kernels for light of a number of channels, compiled for a CUDA device."""
+    return loader.on_device(loader.text("matting.cu"), options(channels), device)
+
+
+def options(channels: int) -> list[str]:
+    """The compiler's options for the kernels of :func:`module`."""
+    return [f"-DCHANNELS={channels}"]
+
+
+@functools.cache
+def argument_type() -> type[ctypes.Structure]:
+    """The structure that all kernels take, as ``matting.h`` defines it."""
+    return loader.structure(loader.text("matting.h"), {})
+
+
+class Matting:
+    """Splits the mixed pixels of images, and computes the gradients of these splits.
+
+    Args:
+        light: ``[B, C, H, W]``.
+        coc_px: ``[B, 1, H, W]``, signed.
+        valid: ``[B, 1, H, W]``, 0 where a pixel is left out; None means all count.
+        covered: Other surfaces by a matte, ``[B, C + 3, H, W]``, or None.
+        launch: The kernels; None takes those of the images' device.
+    """
+
+    def __init__(
+        self, light: Tensor, coc_px: Tensor, valid: Tensor | None, covered: Tensor | None, launch: Launch | None = None
+    ) -> None:
+        self._light, self._coc, self._covered = light, coc_px, covered
+        self._launch = launch or module(light.shape[1], light.device.index or 0)
+        self._darkest, self._brightest = light.flatten(2).aminmax(dim=2)  # of each channel
+        self._edge, self._clean = torch.empty_like(coc_px), torch.empty_like(light)
+        maps = {"light": light, "coc": coc_px, "valid": valid, "covered": covered, "edge": self._edge}
+        maps |= {"clean": self._clean, "darkest": self._darkest, "brightest": self._brightest}
+        self._common = argument_type()(height=light.shape[2], width=light.shape[3])
+        self._set(**maps)
+        for kernel in ("find_edges", "find_clean"):
+            self._run(kernel)
+
+    def surfaces(self) -> Tensor:
+        """Own light, other light, coc and weight of the other surface of each pixel, ``[B, 2 C + 2, H, W]``."""
+        surfaces = self._split()
+        if self._covered is None:
+            return surfaces
+        result = torch.empty_like(surfaces)
+        self._set(result=result)
+        self._run("cover")
+        return result
+
+    def gradients(self, of_result: Tensor) -> list[Tensor]:
+        """The gradients by light, coc and, where it is given, ``covered``, from that of :meth:`surfaces`."""
+        channels = self._light.shape[1]
+        of_values = self._planes(2 * channels + 2).zero_()
+        of_covered: list[Tensor] = []
+        of_surfaces = of_result = of_result.contiguous()
+        if self._covered is not None:
+            self._split()
+            of_surfaces, of_covered = torch.empty_like(of_result), [torch.empty_like(self._covered)]
+            self._set(of_result=of_result, of_covered=of_covered[0])
+        self._set(of_values=of_values, of_surfaces=of_surfaces)
+        if self._covered is not None:
+            self._run("cover_back")
+
+        # the pixels at edges, numbered from 1, and their parts of the gradients
+        slots = (self._edge > 0).flatten().cumsum(0, dtype=torch.int32)
+        self._common.count = count = int(slots[-1]) if len(slots) else 0
+        parts = self._light.new_empty((2 * channels + 2) * _TAPS + 2 * channels, count)
+        of_rows = self._light.new_empty(len(self._light), 4 * channels, self._light.shape[2])
+        self._set(slots=slots, parts=parts, of_rows=of_rows)
+        self._run("split_back")
+        grid = (-(-self._light.shape[2] // _TILE_COLUMNS), channels, len(self._light))
+        self._launch("sum_rows", grid, (_TILE_COLUMNS, 1, 1), self._common)
+        of_ends = of_rows.sum(2)
+        self._set(of_ends=of_ends)
+        self._gather(0, 2 * channels + 2)
+        self._run("find_clean_back")
+        self._gather(0, channels + 2)
+        self._run("find_edges_back")
+        self._gather(channels, 1)
+        return [of_values[:, :channels], of_values[:, channels : channels + 1], *of_covered]
+
+    def _split(self) -> Tensor:
+        """The surfaces without those of a matte."""
+        surfaces = self._planes(2 * self._light.shape[1] + 2)
+        self._surfaces = surfaces  # kept in memory as long as the argument points to it
+        self._set(surfaces=surfaces)
+        self._run("split")
+        return surfaces
+
+    def _gather(self, first: int, planes: int) -> None:
+        """Adds the parts of the gradients by some values of each pixel."""
+        self._common.first, self._common.planes = first, planes
+        self._run("gather")
+
+    def _planes(self, count: int) -> Tensor:
+        return self._light.new_empty(len(self._light), count, *self._light.shape[2:])
+
+    def _set(self, **maps: Tensor | None) -> None:
+        """Points the argument to tensors."""
+        for name, values in maps.items():
+            setattr(self._common, name, loader.pointer(values))
+
+    def _run(self, kernel: str) -> None:
+        height, width = self._light.shape[2:]
+        grid = (-(-width // _TILE_COLUMNS), -(-height // _TILE_ROWS), len(self._light))
+        self._launch(kernel, grid, (_TILE_COLUMNS, _TILE_ROWS, 1), self._common)
