@@ -22,6 +22,9 @@ FOR_DEMO := $(VENV)/.installed-for-demo
 export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
 export PIP_BUILD_CONSTRAINT := $(PIP_CONSTRAINT)
 
+# Some containers set it. Each process that a test starts would compile the modules of PyTorch anew, for ten seconds.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo test oldest docs pictures sweep install check package wheel sanitize fuzz clean
 
 demo: $(FOR_DEMO)
