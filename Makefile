@@ -22,7 +22,10 @@ FOR_DEMO := $(VENV)/.installed-for-demo
 export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
 export PIP_BUILD_CONSTRAINT := $(PIP_CONSTRAINT)
 
-.PHONY: demo test oldest docs pictures sweep install check package wheel sanitize fuzz clean
+# Some containers set it. Each process that a test starts would compile the modules of PyTorch anew, for ten seconds.
+unexport PYTHONDONTWRITEBYTECODE
+
+.PHONY: demo test oldest docs pictures sweep install check style types package wheel sanitize fuzz clean
 
 demo: $(FOR_DEMO)
 	$(BIN)/python examples/demo.py --data examples/data/motorcycle --out out
@@ -47,12 +50,16 @@ sweep: $(INSTALLED)
 
 install: $(INSTALLED)
 
-check: $(INSTALLED) package
+check: style types
+
+style: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/clang-format --dry-run --Werror torchdof/native/*.h torchdof/native/src/* tests/native/*.cpp
 	! command -v $(CXX) >/dev/null || $(CXX) -std=c++17 -fsyntax-only -Wall -Wextra -Werror -Wno-psabi \
 		-Itorchdof/native -Ibuild torchdof/native/src/*.cpp tests/native/*.cpp
+
+types: $(INSTALLED) package
 	MYPYPATH=build/package $(BIN)/mypy -p torchdof
 	MYPYPATH=build/package $(BIN)/mypy tests examples
 

@@ -1,7 +1,7 @@
 """Known hidden surfaces: a background, or a stack of layers."""
 
 import math
-from functools import partial
+from functools import cache, partial
 
 import pytest
 import torch
@@ -19,6 +19,7 @@ SHAPES = (None, posts(90, 30), posts(140, 25, -0.2))
 PLANES = [Plane(z, waves(i), shape) for i, (z, shape) in enumerate(zip(DEPTHS, SHAPES, strict=True))]
 
 
+@cache
 def layers() -> Tensor:
     """Premultiplied light and coverage of each plane, far to near, with what others hide: ``[1, 3, 4, 110, 150]``."""
     y, x = torch.meshgrid(*((torch.arange(12 * n, dtype=torch.float64) + 0.5) / 12 for n in (110, 150)), indexing="ij")
