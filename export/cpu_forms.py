@@ -147,7 +147,7 @@ def join_constants(model: onnx_ir.Model) -> None:
         if outer is None or inner is None:
             continue
         tape = Tape()
-        both = initializer(model.graph, np.float32(outer[1] + inner[1]), f"both_{node.outputs[0].name}")
+        both = initializer(model.graph, np.array(outer[1] + inner[1], np.float32), f"both_{node.outputs[0].name}")
         tape.op("Add", [inner[0], both])
         _replace(model.graph, node, tape)
 

@@ -6,6 +6,7 @@ without pixels in the window, and the whole tile if it is in focus.
 
 import functools
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 import torch.nn.functional as functional
@@ -164,12 +165,10 @@ class _Tiles:
         self._step = steps(batch * rows * columns)
         self._item, self._row, self._column = pixels.places(self._step.reshape(1), rows, columns)
 
-    def window(
-        self, values: Tensor, size: tuple[int, int], margin: int, start: Sequence[int | torch.SymInt] = (0, 0)
-    ) -> Tensor:
+    def window(self, values: Tensor, size: tuple[int, int], margin: int, start: Sequence[Any] = (0, 0)) -> Tensor:
         """The window of a map for one tile of ``size``, with a margin; the first tile's begins at ``start``."""
         shape = (1, int(values.shape[1]), size[0] + 2 * margin, size[1] + 2 * margin)
-        row, column = (n * length + of for n, length, of in zip((self._row, self._column), size, start, strict=True))
+        row, column = self._row * size[0] + start[0], self._column * size[1] + start[1]
         first = torch.cat([self._item, torch.zeros_like(self._item), row, column])
         lengths = torch.tensor(shape)
         cut = operator("Slice", [values, first, first + lengths], shape)
