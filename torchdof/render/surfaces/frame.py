@@ -182,10 +182,7 @@ class PaddedFrame:
         x = torch.stack([s.x for s in surfaces])
         weight = torch.stack([torch.ones_like(s.x) if s.weight is None else s.weight for s in surfaces])
         missing = 1.0 - counts(weight) * at_focus(x)
-        if len(surfaces) == 2:
-            alone = torch.stack([missing[1], missing[0]])
-        else:
-            alone = torch.stack([missing[:j].prod(0) * missing[j + 1 :].prod(0) for j in range(len(surfaces))])
+        alone = torch.stack([missing[:j].prod(0) * missing[j + 1 :].prod(0) for j in range(len(surfaces))])
         cover = seen(weight) * stands_in(x) * alone
         if self.stacked:  # a surface covers a part of what nearer ones leave
             left = [torch.ones_like(x[0])]
