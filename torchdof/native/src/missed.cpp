@@ -24,7 +24,7 @@ constexpr int CELL = constants::missed::CELL;
 constexpr int AROUND = constants::missed::AROUND;
 constexpr int PLACE = constants::missed::PLACE;
 constexpr float APART_PX = constants::missed::APART_PX;
-constexpr float APART = constants::missed::APART;
+constexpr float SHARPER = constants::missed::SHARPER;
 constexpr float GRAIN = constants::missed::GRAIN;
 constexpr float OUTLIER = constants::missed::OUTLIER;
 constexpr float UNLIKE = constants::missed::UNLIKE;
@@ -49,10 +49,10 @@ constexpr int RINGS = sizeof(RINGS_PX) / sizeof(RINGS_PX[0]);
 constexpr int COUNTS = 4;  // planes: unlike pixels and all pixels, of the rim and of the background
 static_assert(TILE % CELL == 0 && TILE % LANES == 0 && MARGIN % LANES == 0 && MARGIN >= RINGS_PX[RINGS - 1], "");
 
-// Whether a surface is nearer than, and more blurred than, a pixel of this coc.
-ivec is_nearer(vec near, vec coc) {
-  const vec apart = APART_PX + APART * abs(near);
-  return (coc - near > apart) & (abs(near) - abs(coc) > apart);
+// Whether a pixel with this blur is less blurred than, and thus behind, a near surface of that coc.
+template <typename V>
+auto is_beyond(V blur, V near) {
+  return blur < -SHARPER * near - APART_PX;
 }
 
 bool is_valid(float coc) { return std::fabs(coc) <= LARGEST_PX; }
@@ -184,11 +184,11 @@ class Missed {
       bool is_any_new = false;
       for (int i = end; i < SIDE - end; i++)
         for (int at = i * PITCH + LANES; at < (i + 1) * PITCH - LANES; at += LANES) {
-          const vec c = load<vec>(coc + at), was = load<vec>(near + at);
+          const vec was = load<vec>(near + at);
           vec least = load<vec>(lowest + at);
           for (int v = PITCH; v <= reach * PITCH; v += PITCH)
             least = min(min(least, load<vec>(lowest + at - v)), load<vec>(lowest + at + v));
-          const ivec is_new = (was == FAR_PX) & (c < FAR_PX) & is_nearer(least, c);
+          const ivec is_new = (was == FAR_PX) & is_beyond(abs(load<vec>(coc + at)), least);
           if (!any_of(is_new)) continue;
           is_any_new = true;
           store(near + at, is_new ? least : was);
@@ -397,7 +397,7 @@ class Missed {
         });
         const float coc = map_.out[(size_t)y * width_ + x];
         float &may = ring_[(size_t)y * pitch_ + x];
-        if (may == 0 || !any_of(is_nearer(broadcast(nearest), broadcast(coc)))) continue;
+        if (may == 0 || !is_beyond(std::fabs(coc), nearest)) continue;
         may = 0;
         near_[(size_t)y * pitch_ + x] = nearest;
         taken.push_back({y, x});

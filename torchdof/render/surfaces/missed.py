@@ -20,8 +20,8 @@ from ..rules import active
 
 __all__ = ["completed"]
 
-_APART_PX = 2.0  # px; smallest difference in coc, and in blur, of a near surface; larger: fewer edges
-_APART = 0.3  # added to it, over the blur of the near surface; larger: a foreground that slopes has no edges within
+_SHARPER = 0.7  # largest blur of a pixel beyond an edge, over that of the near surface; larger: edges within slopes
+_APART_PX = 2.0  # px; subtracted from it; larger: fewer edges
 _RINGS_PX = (1, 2, 3, 7, 14)  # px; distance from the near surface at which each ring ends
 _RIM = 3  # rings in which the map may have missed something; the first is mixed by the image itself
 _SAMPLED = 2  # rows; every so many are compared; larger: faster, coarser
@@ -83,23 +83,16 @@ def completed(image: Tensor, coc_px: Tensor, ops: Ops = EAGER) -> Tensor:
 @torch.no_grad()
 def _completed(image: Tensor, coc_px: Tensor, ops: Ops) -> Tensor:
     """:func:`completed` by PyTorch, for float32."""
-    valid = coc_px.abs() <= _LARGEST_PX
-    coc = torch.where(valid, coc_px, _FAR_PX)
-
-    def is_nearer(near: Tensor) -> Tensor:
-        apart = _APART_PX + _APART * near.abs()
-        return valid & (coc - near > apart) & (near.abs() - coc.abs() > apart)
-
-    lowest = _lowest(coc, 1)
-    has_edges = is_nearer(lowest).any()
-    if not is_traced() and not has_edges:
-        return coc_px
-    near, ring = torch.full_like(coc, _FAR_PX), torch.zeros_like(coc)
+    is_valid = coc_px.abs() <= _LARGEST_PX
+    coc, blur = torch.where(is_valid, coc_px, 0.0), torch.where(is_valid, coc_px.abs(), _FAR_PX)
+    # blur of the near surface, of which each ring takes the largest around it; negative behind the focus
+    surface = torch.where(is_valid, -coc_px, -_FAR_PX)
+    near, ring = torch.full_like(coc, -_FAR_PX), torch.zeros_like(coc)
     for k in range(len(_RINGS_PX)):
-        if k > 0:
-            lowest = _lowest(near, _RINGS_PX[k] - _RINGS_PX[k - 1])
-        is_new = (ring == 0) & is_nearer(lowest)
-        near, ring = torch.where(is_new, lowest, near), torch.where(is_new, k + 1.0, ring)
+        around = _largest(surface, _RINGS_PX[0]) if k == 0 else _largest(near, _RINGS_PX[k] - _RINGS_PX[k - 1])
+        is_new = (ring == 0) & _is_beyond(blur, around)
+        near, ring = torch.where(is_new, around, near), torch.where(is_new, k + 1.0, ring)
+    has_edges = ring.any()
 
     light = torch.where(torch.isfinite(image), image, 0.0).clamp(0.0, _BRIGHTEST).sqrt()
     is_sampled = (torch.arange(coc.shape[-2], device=coc.device) % _SAMPLED == 0)[:, None]
@@ -107,7 +100,7 @@ def _completed(image: Tensor, coc_px: Tensor, ops: Ops) -> Tensor:
     deviation = _compared(light, on_surface, samples)[0]
     weight = samples / (1.0 + deviation / _OUTLIER).square()
     deviation, middle, spread, seen = _compared(light, on_surface, weight)
-    is_one = spread.sqrt() + (middle - on_surface).abs() < _ON_SURFACE * (on_surface - near)
+    is_one = spread.sqrt() + (middle - on_surface).abs() < _ON_SURFACE * (on_surface + near)
     known = (ring > 0) & (seen > _LEAST_SAMPLES) & is_one
     odds = (deviation / _UNLIKE).clamp(max=_MOST_UNLIKE).square()
     unlike = odds / (1.0 + odds)
@@ -119,13 +112,21 @@ def _completed(image: Tensor, coc_px: Tensor, ops: Ops) -> Tensor:
     excess = (found / count.clamp_min(1e-9) - usual) / (1.0 - usual).clamp_min(0.1)
     pixels = count * float((_CELL * (2 * _PLACE + 1)) ** 2)
     excess = excess * (pixels / _COUNTED).clamp(max=1.0) * (of_usual > _COMPARED * count)
-    taken = known & (deviation > _TAKEN) & (_of_cells(excess, ring) > _MISSED)
+    may = known & (deviation > _TAKEN) & (_of_cells(excess, ring) > _MISSED)
+    if not is_traced() and not may.any():
+        return coc_px
 
-    out = coc
     for _ in range(_REACH):
-        lowest = _lowest(out, 1)
-        out = torch.where(taken & (out == coc) & is_nearer(lowest), lowest, out)
-    return ops.equal_unless(lambda: has_edges, torch.where(valid, out, coc_px), coc_px)
+        around = _largest(surface, 1)
+        is_taken = may & _is_beyond(blur, around)
+        surface, may = torch.where(is_taken, around, surface), may & ~is_taken
+    completed = torch.where(is_valid, -surface, coc_px)
+    return ops.equal_unless(lambda: has_edges, completed, coc_px)
+
+
+def _is_beyond(blur: Tensor, near: Tensor) -> Tensor:
+    """Whether a pixel with this blur is less blurred than, and thus behind, a near surface with that blur."""
+    return blur < _SHARPER * near - _APART_PX
 
 
 # What is computed depends on the data, which compiled graphs do not support.
@@ -162,5 +163,5 @@ def _of_cells(cells: Tensor, like: Tensor) -> Tensor:
     return pixels[..., : like.shape[-2], : like.shape[-1]]
 
 
-def _lowest(values: Tensor, reach: int) -> Tensor:
-    return -functional.max_pool2d(-values, 2 * reach + 1, stride=1, padding=reach)
+def _largest(values: Tensor, reach: int) -> Tensor:
+    return functional.max_pool2d(values, 2 * reach + 1, stride=1, padding=reach)
