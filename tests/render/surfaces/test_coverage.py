@@ -140,7 +140,9 @@ def test_gradients_flow_to_the_matte() -> None:
 
     coc = coc + 0.05 * draw(1, 1, 6, 7)
     seen, leaves = draw(1, 3, 6, 7) - 0.5, (image.requires_grad_(), coc.requires_grad_(), matte)
-    assert gradcheck(lambda *given: (render(*given) * seen).sum(), leaves, fast_mode=True)  # along a random direction of each input
+    assert gradcheck(
+        lambda *given: (render(*given) * seen).sum(), leaves, fast_mode=True
+    )  # along a random direction of each input
     (gradient,) = torch.autograd.grad(render(image, coc, matte).square().sum(), matte)
     assert float(gradient[..., 3].abs().min()) > 0
 

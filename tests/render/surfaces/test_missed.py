@@ -9,12 +9,13 @@ from tests.scenes import TURNS, furry_post, pixels_from_post
 from torchdof import native
 from torchdof.render.surfaces import missed
 
+DAMAGED = torch.zeros(1, 1, 224, 160)  # stands for a map that the repair has changed
 COMPILED = pytest.mark.skipif(not native.chosen(), reason="the compiled engine is not built here")
 
 
 def test_missed_hair_gets_the_coc_of_its_foreground(engine: str) -> None:
     image, given, exact = furry_post()
-    completed = missed.completed(image, given)
+    completed = missed.completed(image, given, DAMAGED)
     completed, given, exact = (
         t[..., 40:-40, :] for t in (completed, given, exact)
     )  # elsewhere a window has few pixels
@@ -25,7 +26,12 @@ def test_missed_hair_gets_the_coc_of_its_foreground(engine: str) -> None:
 @pytest.mark.parametrize("turn", TURNS)
 def test_an_exact_map_stays(engine: str, turn: str) -> None:
     image, _, exact = (TURNS[turn](t).contiguous() for t in furry_post())
-    assert missed.completed(image, exact).equal(exact)
+    assert missed.completed(image, exact, exact - 1).equal(exact)
+
+
+def test_a_map_that_needs_no_repair_stays(engine: str) -> None:
+    image, given, _ = furry_post()
+    assert missed.completed(image, given, given).equal(given)
 
 
 def test_things_of_the_background_are_left_to_it(engine: str) -> None:
@@ -34,29 +40,31 @@ def test_things_of_the_background_are_left_to_it(engine: str) -> None:
     given = torch.where(pixels_from_post(160) < 0, -12.0, 0.5).expand(1, 1, 224, -1).contiguous()
     strands = torch.rand(1, 1, 224, 1, generator=torch.Generator().manual_seed(1)) < 0.4
     light = torch.where((given < 0) | strands, 0.05, image.amax())
-    assert missed.completed(light.expand(-1, 3, -1, -1).contiguous(), given).equal(given)
+    assert missed.completed(light.expand(-1, 3, -1, -1).contiguous(), given, DAMAGED).equal(given)
 
 
 def test_a_sharper_foreground_is_left_alone(engine: str) -> None:
     image, given, _ = furry_post()
     sharper = torch.where(given < 0, 0.0, 12.0)  # the focus is on the fur
-    assert missed.completed(image, sharper).equal(sharper)
+    assert missed.completed(image, sharper, DAMAGED).equal(sharper)
 
 
 def test_items_of_a_batch_are_completed_independently(engine: str) -> None:
     image, given, exact = furry_post()
     images, maps = torch.cat([image, image.flip(-2), image]), torch.cat([given, given.flip(-2), exact])
-    together = missed.completed(images, maps)
+    before = torch.cat([0 * given, given, given])  # the second has not been repaired
+    together = missed.completed(images, maps, before)
     for k in range(3):
-        assert together[k : k + 1].equal(missed.completed(images[k : k + 1], maps[k : k + 1]))
+        assert together[k : k + 1].equal(missed.completed(images[k : k + 1], maps[k : k + 1], before[k : k + 1]))
 
 
 def test_invalid_values_stay_and_affect_nothing(engine: str) -> None:
     image, given, _ = furry_post()
     holes = torch.rand(given.shape, generator=torch.Generator().manual_seed(2)) < 0.02
-    completed = [missed.completed(image, torch.where(holes, value, given)) for value in (math.nan, -math.inf, 3e38)]
+    values = (math.nan, -math.inf, 3e38)
+    completed = [missed.completed(image, torch.where(holes, value, given), DAMAGED) for value in values]
     assert not completed[0][~holes].equal(given[~holes])
-    for result, value in zip(completed, (math.nan, -math.inf, 3e38), strict=True):
+    for result, value in zip(completed, values, strict=True):
         torch.testing.assert_close(result[holes], torch.full_like(result[holes], value), rtol=0, atol=0, equal_nan=True)
         assert result[~holes].equal(completed[0][~holes])
 
@@ -64,7 +72,7 @@ def test_invalid_values_stay_and_affect_nothing(engine: str) -> None:
 def test_gradients_flow_to_pixels_that_stay() -> None:
     image, given, _ = furry_post()
     coc = given.clone().requires_grad_()
-    completed = missed.completed(image, coc)
+    completed = missed.completed(image, coc, DAMAGED)
     completed.sum().backward()
     assert coc.grad is not None and coc.grad.equal((completed.detach() == given).float())
 
@@ -81,7 +89,7 @@ def test_engines_agree(size: tuple[int, int]) -> None:
         given += 0.2 * torch.randn(given.shape, generator=generator)
         bad = torch.rand(given.shape, generator=generator) < 0.01 * seed
         given[bad], image[:, :, bad[0, 0].flip(0)] = math.nan, math.inf
-        plain = missed._completed(image, given, missed.EAGER)
+        plain = missed._completed(image, given, torch.tensor([True]), missed.EAGER)
         fast = native.missed_parts(image[0], given[0, 0])
         torch.testing.assert_close(fast, plain[0, 0], rtol=0, atol=0, equal_nan=True)
 
@@ -100,4 +108,4 @@ def test_any_number_of_threads_gives_the_same_bits() -> None:
 def test_completion_compiles_without_graph_breaks() -> None:
     image, given, _ = furry_post()
     compiled = torch.compile(missed.completed, backend="eager", fullgraph=True)
-    assert compiled(image, given).equal(missed.completed(image, given))
+    assert compiled(image, given, DAMAGED).equal(missed.completed(image, given, DAMAGED))

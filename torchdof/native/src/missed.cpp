@@ -39,7 +39,7 @@ constexpr float FAR_PX = constants::missed::FAR_PX;
 constexpr float LARGEST_PX = constants::missed::LARGEST_PX;
 constexpr float BRIGHTEST = constants::missed::BRIGHTEST;
 
-constexpr int TILE = 64;                 // px; side of the squares that a thread processes at once
+constexpr int TILE = 128;                // px; side of the squares that a thread processes at once
 constexpr int MARGIN = 16;               // px around it in which rings are found, too
 constexpr int SIDE = TILE + 2 * MARGIN;  // px; side of a window
 constexpr int PITCH = SIDE + 2 * LANES;  // of a window; its columns begin at LANES
@@ -56,6 +56,17 @@ auto is_beyond(V blur, V near) {
 }
 
 bool is_valid(float coc) { return std::fabs(coc) <= LARGEST_PX; }
+
+// The least of 2 * reach + 1 values around each of a vector. Two chains of operations, of which processors work on
+// both.
+vec least_of(const float *at, int stride, int reach) {
+  vec before = load<vec>(at), after = load<vec>(at + stride);
+  for (int u = 1; u < reach; u++) {
+    before = min(before, load<vec>(at - u * stride));
+    after = min(after, load<vec>(at + (u + 1) * stride));
+  }
+  return min(min(before, load<vec>(at - reach * stride)), after);
+}
 
 // Means over windows of 2 * reach + 1 cells in planes of sums, of which cells beyond the frame are 0.
 class Around {
@@ -103,21 +114,23 @@ class Missed {
   bool run() {
     find_rings();
     if (tiles_.empty()) return false;
-    std::vector<float> means = background({});
-    around_(means, AROUND);
-    means = background(means);
-    around_(means, AROUND);
+    const std::vector<float> means = described(background(described(background({}))));
     std::vector<float> counts = count(means);
     around_(counts, PLACE);
     return take(means, counts);
   }
 
  private:
-  // The background around the pixels of a row of cells, which share it cell by cell.
+  // Planes of described() for the pixels of a row of cells of a tile.
   struct Background {
-    explicit Background(int channels) : mean((size_t)channels * TILE) {}
-    std::vector<float> mean;  // of the square root of light, channel by channel
-    float per_variance[TILE], coc[TILE], spread[TILE], seen[TILE];
+    explicit Background(int channels) : values((size_t)(channels + 4) * TILE), channels(channels) {}
+    const float *seen() const { return &values[0]; }
+    const float *light(int c) const { return &values[(size_t)(1 + c) * TILE]; }
+    const float *per_variance() const { return &values[(size_t)(1 + channels) * TILE]; }
+    const float *coc() const { return &values[(size_t)(2 + channels) * TILE]; }
+    const float *spread() const { return &values[(size_t)(3 + channels) * TILE]; }
+    std::vector<float> values;
+    int channels;
   };
 
   template <typename Body>
@@ -153,7 +166,9 @@ class Missed {
   }
 
   bool rings_of(int tile) const {
-    alignas(32) float coc[WINDOW], near[WINDOW], lowest[WINDOW], ring[WINDOW];
+    const Buffer<float> windows(4 * WINDOW);
+    float *const coc = windows.data(), *const near = coc + WINDOW, *const lowest = near + WINDOW,
+                 *const ring = lowest + WINDOW;
     const int y0 = tile / across_ * TILE, x0 = tile % across_ * TILE, rows = std::min(TILE, height_ - y0);
     std::fill_n(coc, WINDOW, FAR_PX);
     const int from_x = std::max(x0 - MARGIN, 0), to_x = std::min(x0 + TILE + MARGIN, width_);
@@ -176,18 +191,13 @@ class Missed {
       const int end = RINGS_PX[k], reach = k == 0 ? end : end - RINGS_PX[k - 1];
       const float *const from = k == 0 ? coc : near;
       for (int i = end - reach; i < SIDE - end + reach; i++)
-        for (int at = i * PITCH + LANES; at < (i + 1) * PITCH - LANES; at += LANES) {
-          vec least = load<vec>(from + at);
-          for (int u = 1; u <= reach; u++) least = min(min(least, load<vec>(from + at - u)), load<vec>(from + at + u));
-          store(lowest + at, least);
-        }
+        for (int at = i * PITCH + LANES; at < (i + 1) * PITCH - LANES; at += LANES)
+          store(lowest + at, least_of(from + at, 1, reach));
       bool is_any_new = false;
       for (int i = end; i < SIDE - end; i++)
         for (int at = i * PITCH + LANES; at < (i + 1) * PITCH - LANES; at += LANES) {
           const vec was = load<vec>(near + at);
-          vec least = load<vec>(lowest + at);
-          for (int v = PITCH; v <= reach * PITCH; v += PITCH)
-            least = min(min(least, load<vec>(lowest + at - v)), load<vec>(lowest + at + v));
+          const vec least = least_of(lowest + at, PITCH, reach);
           const ivec is_new = (was == FAR_PX) & is_beyond(abs(load<vec>(coc + at)), least);
           if (!any_of(is_new)) continue;
           is_any_new = true;
@@ -225,21 +235,36 @@ class Missed {
     }
   }
 
+  // Means around cells, of sums of background(): weight; light, its square; coc, its square. The squares become one
+  // over the variance of light, and the standard deviation of coc.
+  std::vector<float> described(std::vector<float> planes) const {
+    around_(planes, AROUND);
+    parallel(map_.threads, rows_, map_.cancelled, [&](int y, int) {
+      float *const seen = &planes[(size_t)y * columns_], *const light = seen + cells_;
+      float *const square = light + channels_ * cells_, *const coc = square + cells_, *const coc_square = coc + cells_;
+      const float per_channel = 1.0f / (float)channels_;
+      for (int x = 0; x < columns_; x++) {
+        const float per = 1.0f / std::max(seen[x], 1e-9f);
+        float bright = 0;
+        for (int c = 0; c < channels_; c++) {
+          float &mean = light[c * cells_ + x];
+          mean *= per, bright += per_channel * mean * mean;
+        }
+        const float variance = std::max(square[x] * per - bright, 0.0f) + GRAIN * bright + 1e-12f;
+        square[x] = per_channel / variance, coc[x] *= per;
+        coc_square[x] = std::sqrt(std::max(coc_square[x] * per - coc[x] * coc[x], 0.0f));
+      }
+    });
+    return planes;
+  }
+
+  // The background around the pixels of a row of cells of a tile, which share it cell by cell.
   Background background_of(const std::vector<float> &means, int tile, int y) const {
     Background of(channels_);
-    for (int k = 0; k < std::min(CELLS, columns_ - tile % across_ * CELLS); k++) {
-      const auto put = [&](float *to, float value) { std::fill_n(to + k * CELL, CELL, value); };
-      const float *const cell = &means[(size_t)y * columns_ + tile % across_ * CELLS + k];
-      const float per = 1.0f / std::max(cell[0], 1e-9f), per_channel = 1.0f / (float)channels_;
-      float bright = 0;
-      for (int c = 0; c < channels_; c++) {
-        const float mean = cell[(1 + c) * cells_] * per;
-        put(&of.mean[c * TILE], mean), bright += per_channel * mean * mean;
-      }
-      const float variance = std::max(cell[(1 + channels_) * cells_] * per - bright, 0.0f) + GRAIN * bright + 1e-12f;
-      const float coc = cell[(2 + channels_) * cells_] * per, square = cell[(3 + channels_) * cells_] * per;
-      put(of.seen, cell[0]), put(of.per_variance, per_channel / variance);
-      put(of.coc, coc), put(of.spread, std::sqrt(std::max(square - coc * coc, 0.0f)));
+    for (int plane = 0; plane < channels_ + 4; plane++) {
+      const float *const cells = &means[plane * cells_ + (size_t)y * columns_ + tile % across_ * CELLS];
+      for (int k = 0; k < std::min(CELLS, columns_ - tile % across_ * CELLS); k++)
+        std::fill_n(&of.values[plane * TILE + k * CELL], CELL, cells[k]);
     }
     return of;
   }
@@ -248,16 +273,16 @@ class Missed {
   vec deviation(size_t at, const Background &of, int j) const {
     vec off{};
     for (int c = 0; c < channels_; c++) {
-      const vec apart = load<vec>(&roots_[c * plane_ + at]) - load<vec>(&of.mean[c * TILE + j]);
+      const vec apart = load<vec>(&roots_[c * plane_ + at]) - load<vec>(of.light(c) + j);
       off += apart * apart;
     }
-    return off * load<vec>(of.per_variance + j);
+    return off * load<vec>(of.per_variance() + j);
   }
 
   // Where the background around pixels is one surface, which continues theirs.
   ivec known(size_t at, const Background &of, int j) const {
-    const vec coc = load<vec>(&coc_[at]), apart = load<vec>(of.spread + j) + abs(load<vec>(of.coc + j) - coc);
-    return (load<vec>(&ring_[at]) > vec{}) & (load<vec>(of.seen + j) > LEAST_SAMPLES) &
+    const vec coc = load<vec>(&coc_[at]), apart = load<vec>(of.spread() + j) + abs(load<vec>(of.coc() + j) - coc);
+    return (load<vec>(&ring_[at]) > vec{}) & (load<vec>(of.seen() + j) > LEAST_SAMPLES) &
            (apart < ON_SURFACE * (coc - load<vec>(&near_[at])));
   }
 

@@ -183,9 +183,9 @@ def mended(image: Tensor, coc_px: Tensor, edges: DepthEdges, ops: Ops = EAGER) -
             return coc_px
     given = coc_px.detach()
     repaired = repair(image, given, STEP_PX, auto=edges == "auto", of_coc=True, ops=ops)
-    repaired = completed(image, repaired, ops)
     if repaired is given:
         return coc_px
+    repaired = completed(image, repaired, given, ops)
     repaired = ops.equal_unless(lambda: _has_steps(coc_px), repaired, coc_px)
     return torch.where(repaired == coc_px, coc_px, repaired) if is_differentiated(coc_px) else repaired
 

@@ -44,8 +44,10 @@ _LARGEST_PX = 1e6  # px; largest valid coc, whose square is exact enough
 _BRIGHTEST = 1e15  # largest light that is compared
 
 
-def completed(image: Tensor, coc_px: Tensor, ops: Ops = EAGER) -> Tensor:
+def completed(image: Tensor, coc_px: Tensor, before: Tensor, ops: Ops = EAGER) -> Tensor:
     """Gives missed fine parts of blurred foregrounds the coc of the foreground.
+
+    Maps that the repair of edges has left as they are count as exact, and stay.
 
     1. Rings around a near surface: the pixels of a less blurred one across an edge, by their distance from it.
     2. The background around each pixel: mean and variance of the square root of light in the outer two rings. A second
@@ -59,6 +61,7 @@ def completed(image: Tensor, coc_px: Tensor, ops: Ops = EAGER) -> Tensor:
     Args:
         image: ``[B, C, H, W]``, linear light; its scale does not matter.
         coc_px: ``[B or 1, 1, H, W]``, signed, with repaired edges. Invalid values stay and affect no other pixel.
+        before: The map before the repair, like ``coc_px``.
         ops: Skips frames without such edges.
 
     Returns:
@@ -66,24 +69,26 @@ def completed(image: Tensor, coc_px: Tensor, ops: Ops = EAGER) -> Tensor:
     """
     if not active().missed_parts:
         return coc_px
-    given, light = coc_px.detach().float().expand(image.shape[0], -1, -1, -1), image.detach().float()
+    light = image.detach().float()
+    repaired, before = (t.detach().float().expand(image.shape[0], -1, -1, -1) for t in (coc_px, before))
+    is_inexact = ((repaired - before).abs() > 0).flatten(1).any(1)
     if is_compiled():
-        near_px = _operator(light, given)
+        near_px = _operator(light, repaired, is_inexact)
     elif not is_traced() and all(map(is_in_memory, (image, coc_px))) and native.chosen():
-        maps = [of_item[0] for of_item in given]
-        items = [native.missed_parts(a, b) for a, b in zip(light, maps, strict=True)]
+        maps = [of_item[0] for of_item in repaired]
+        items = [native.missed_parts(a, b) if c else b for a, b, c in zip(light, maps, is_inexact, strict=True)]
         if all(new is old for new, old in zip(items, maps, strict=True)):
             return coc_px
         near_px = torch.stack(items)[:, None]
     else:
-        near_px = _completed(light, given, ops)
-    return torch.where(near_px == given, coc_px, near_px.to(coc_px.dtype))
+        near_px = _completed(light, repaired, is_inexact, ops)
+    return torch.where(near_px == repaired, coc_px, near_px.to(coc_px.dtype))
 
 
 @torch.no_grad()
-def _completed(image: Tensor, coc_px: Tensor, ops: Ops) -> Tensor:
+def _completed(image: Tensor, coc_px: Tensor, is_inexact: Tensor, ops: Ops) -> Tensor:
     """:func:`completed` by PyTorch, for float32."""
-    is_valid = coc_px.abs() <= _LARGEST_PX
+    is_valid = (coc_px.abs() <= _LARGEST_PX) & is_inexact[:, None, None, None]
     coc, blur = torch.where(is_valid, coc_px, 0.0), torch.where(is_valid, coc_px.abs(), _FAR_PX)
     # blur of the near surface, of which each ring takes the largest around it; negative behind the focus
     surface = torch.where(is_valid, -coc_px, -_FAR_PX)
@@ -130,9 +135,9 @@ def _is_beyond(blur: Tensor, near: Tensor) -> Tensor:
 
 
 # What is computed depends on the data, which compiled graphs do not support.
-@one_operator("torchdof::missed_parts", lambda image, coc_px: coc_px.new_empty(coc_px.shape))
-def _operator(image: Tensor, coc_px: Tensor) -> Tensor:
-    return _completed(image, coc_px, EAGER).clone(memory_format=torch.contiguous_format)
+@one_operator("torchdof::missed_parts", lambda image, coc_px, is_inexact: coc_px.new_empty(coc_px.shape))
+def _operator(image: Tensor, coc_px: Tensor, is_inexact: Tensor) -> Tensor:
+    return _completed(image, coc_px, is_inexact, EAGER).clone(memory_format=torch.contiguous_format)
 
 
 def _compared(light: Tensor, coc: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
