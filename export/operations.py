@@ -6,7 +6,6 @@ without pixels in the window, and the whole tile if it is in focus.
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import torch
 import torch.nn.functional as functional
@@ -17,21 +16,11 @@ from torchdof.optics.blur_table import BlurTable
 from torchdof.pixels import Selected
 from torchdof.render.engines.ops import Level, Ops, Seen
 from torchdof.render.layers.plan import Plan
-from torchdof.render.surfaces.disocclusion import (
-    LEAST_TOTAL,
-    counted_behind,
-    end_of_surface,
-    is_another_surface,
-    is_read,
-    mean_behind,
-    votes_of,
-)
+from torchdof.render.surfaces.disocclusion import counted_behind, is_another_surface, mean_behind, search
 from torchdof.render.surfaces.frame import Highlights, PaddedFrame, PaddedSurface
-from torchdof.render.surfaces.matting import NEVER_PX
 
 from .rays import kernels_of, splat
 from .structure import choose, collect, operator, steps
-from .tile_frame import TileFrame
 
 __all__ = ["GraphOps", "WholeOps"]
 
@@ -73,43 +62,31 @@ class GraphOps(Ops):
     def seen(
         self, look: Callable[[Sequence[Level], Tensor], Seen], levels: Sequence[Level], coc_px: Tensor, mask: Tensor
     ) -> Seen:
-        """Tile by tile, and only the levels with samples behind a pixel of the mask in a tile."""
+        """Tile by tile, and only in tiles with pixels of the mask behind which a surface may lie."""
         size = (coc_px.shape[-2], coc_px.shape[-1])
         covered = [levels[0].step * n for n in levels[0].values.shape[-2:]]  # px; the levels are centred on the image
-        side, coarsest = _TILES[0], max(level.step for level in levels)
+        side = _TILES[0]
+        counts, missing = _counts(covered, side)
+        top, left = ((w - n) // 2 for w, n in zip(covered, size, strict=True))
         halves = [torch.scalar_tensor((w - n) % 2, dtype=coc_px.dtype) for w, n in zip(covered, size, strict=True)]
-        # the tiles begin with a sample of all levels, some pixels before the image
-        starts = [(w - n) // 2 // coarsest * coarsest for w, n in zip(covered, size, strict=True)]
-        top, left = ((w - n) // 2 - start for w, n, start in zip(covered, size, starts, strict=True))
-        counts, missing = _counts((top + size[0], left + size[1]), side)
-        padded = functional.pad(torch.cat([coc_px, mask], 1), (left, missing[1], top, missing[0]), mode="replicate")
-        spare = [
-            torch.sym_max(start + length * n - w, 0)
-            for start, length, n, w in zip(starts, side, counts, covered, strict=True)
-        ]
+        ends = [left, covered[1] + missing[1] - size[1] - left, top, covered[0] + missing[0] - size[0] - top]
+        padded = functional.pad(torch.cat([coc_px, mask], 1), ends, mode="replicate")
         tiles = _Tiles(padded.shape[0], *counts)
         coc_px, mask = tiles.window(padded, side, 0).split(1, 1)
-        end_px = end_of_surface(coc_px)
-        looked_px = end_px + (1.0 - mask) * NEVER_PX  # behind all where nothing is looked for
-        found, hides = [], []
+        windows, behind = [], []
         for level in levels:
-            ends = [1, 1 + spare[1] // level.step, 1, 1 + spare[0] // level.step]
+            ends = [1, 1 + missing[1] // level.step, 1, 1 + missing[0] // level.step]
             of_level = (side[0] // level.step, side[1] // level.step)
-            first = (starts[0] // level.step, starts[1] // level.step)
-            values = tiles.window(functional.pad(level.values, ends, mode="replicate"), of_level, 1, first)
-            farthest = _enlarged(functional.max_pool2d(values[:, -2:-1], 2, stride=1), side, level.step)
-            hides.append(is_another_surface((farthest - looked_px).max()) > 0)
+            values = tiles.window(functional.pad(level.values, ends, mode="replicate"), of_level, 1)
+            windows.append(values)
             samples = _samples(values, side, level.step, (halves[0], halves[1]))
             parts = [counted_behind(sample, share, coc_px) for sample, share in samples]
-            seen, weight = mean_behind(*(functools.reduce(torch.add, each) for each in zip(*parts, strict=True)))
-            slope, most = (torch.scalar_tensor(n, dtype=coc_px.dtype) for n in (level.slope, level.most))
-            votes = votes_of(is_read(coc_px, level.least_px), weight, slope, most)
-            terms = torch.cat([seen * votes, votes], 1)
-            found.append(choose(hides[-1], terms, torch.zeros_like(terms)))
-        summed = functools.reduce(torch.add, found)
-        votes = summed[:, -1:]
-        surfaces = torch.cat([summed[:, :-1] / votes.clamp_min(LEAST_TOTAL), votes], 1)
-        tile = choose(functools.reduce(torch.logical_or, hides), surfaces, torch.zeros_like(surfaces))
+            behind.append(mean_behind(*(functools.reduce(torch.add, each) for each in zip(*parts, strict=True))))
+        lights, weights = (torch.stack(parts) for parts in zip(*behind, strict=True))
+        surfaces = torch.cat(search(levels, lights, weights, coc_px), 1)
+        nearest = torch.stack([values[:, -2].max() for values in windows]).max()
+        hides = (mask.max() > 0) & (is_another_surface(nearest - coc_px.min()) > 0)
+        tile = choose(hides, surfaces, torch.zeros_like(surfaces))
         # narrow() instead of slices: tracing then knows the sizes of the result
         maps = tiles.joined(tile).narrow(-2, top, size[0]).narrow(-1, left, size[1])
         return maps[:, :-1], maps[:, -1:]
@@ -142,7 +119,7 @@ class GraphOps(Ops):
         surfaces = [PaddedSurface(*(window(t, margin) for t in s if t is not None)) for s in frame.surfaces]
         behind = None if frame.behind is None else window(frame.behind, 0)
         inside = (..., slice(margin, margin + size[0]), slice(margin, margin + size[1]))
-        tile_frame = TileFrame(surfaces, frame.nodes, frame.ramps, behind, margin, size, size, frame.occlusion)
+        tile_frame = PaddedFrame(surfaces, frame.nodes, frame.ramps, behind, margin, size, size, frame.occlusion)
         rendered, sharp = render(tile_frame), surfaces[0].light[inside]
         weights = int(rendered.shape[1]) - frame.colours  # of the light, in further channels; 1 where it is sharp
         if weights:
@@ -165,11 +142,10 @@ class _Tiles:
         self._step = steps(batch * rows * columns)
         self._item, self._row, self._column = pixels.places(self._step.reshape(1), rows, columns)
 
-    def window(self, values: Tensor, size: tuple[int, int], margin: int, start: Sequence[Any] = (0, 0)) -> Tensor:
-        """The window of a map for one tile of ``size``, with a margin; the first tile's begins at ``start``."""
+    def window(self, values: Tensor, size: tuple[int, int], margin: int) -> Tensor:
+        """The window of a map for one tile of ``size``, with a margin."""
         shape = (1, int(values.shape[1]), size[0] + 2 * margin, size[1] + 2 * margin)
-        row, column = self._row * size[0] + start[0], self._column * size[1] + start[1]
-        first = torch.cat([self._item, torch.zeros_like(self._item), row, column])
+        first = torch.cat([self._item, torch.zeros_like(self._item), self._row * size[0], self._column * size[1]])
         lengths = torch.tensor(shape)
         cut = operator("Slice", [values, first, first + lengths], shape)
         # runtimes do not know the size of a slice, and use fast convolutions only for known sizes
@@ -193,8 +169,8 @@ def _samples(
     ``[B, C, h, w]`` are samples at every ``step``-th pixel, a power of two, with one more on each side; ``half_px`` is
     the offset of the map's centre from theirs, below and to the right, in half pixels: 0 or 1.
     """
-    first = step // 2  # of the samples before the first pixel
     enlarged = functional.interpolate(values, scale_factor=float(step), mode="nearest")
+    first = step // 2  # of the samples before the first pixel
     shares = []
     for n, half in zip(size, half_px, strict=True):
         position = 2 * torch.arange(n, device=values.device) + 2 * first + 1
@@ -208,12 +184,6 @@ def _samples(
         for row in (0, 1)
         for column in (0, 1)
     ]
-
-
-def _enlarged(values: Tensor, size: tuple[int, int], step: int) -> Tensor:
-    """A map of the four samples around each pixel, ``[B, C, h + 1, w + 1]``, at the pixels of a map of ``size``."""
-    enlarged = functional.interpolate(values, scale_factor=float(step), mode="nearest")
-    return enlarged.narrow(-2, step // 2, size[0]).narrow(-1, step // 2, size[1])
 
 
 class WholeOps(Ops):

@@ -15,15 +15,11 @@ from onnxscript.optimizer import fold_constants
 
 from .cpu_forms import (
     chain_reductions,
-    concatenate_once,
     concatenate_zeros,
     constant,
     convolve_averages,
     gather_rows,
     initializer,
-    join_constants,
-    sizes,
-    threshold,
 )
 from .structure import structure
 
@@ -34,15 +30,6 @@ _WINDOW_DEFAULTS = {"pads": 0, "dilations": 1, "strides": 1}  # defaults of thes
 _WHOLE_AXIS = 2**62  # ends of slices beyond it are those of an axis of any length
 _SINGLE = {"CumSum": (0,), "Max": (0, 1), "Min": (0, 1), "Range": (0, 1, 2), "Resize": (2,), "TopK": (0,)}
 """Inputs that stay in single precision in files converted to half precision."""
-_FAST_ON_CPUS = (
-    concatenate_once,
-    convolve_averages,
-    concatenate_zeros,
-    chain_reductions,
-    gather_rows,
-    join_constants,
-    threshold,
-)
 _MAX_EQUAL = 64  # constants with more equal numbers than this are stored as a shape and a value
 
 
@@ -72,7 +59,7 @@ def slim(model: onnx_ir.Model, straight: bool = False) -> onnx_ir.Model:
         passes.ShapeInferencePass(),
         *((_share_sizes,) if straight else ()),
         _join_slices,
-        *(() if straight else _FAST_ON_CPUS),
+        *(() if straight else (convolve_averages, concatenate_zeros, chain_reductions, gather_rows)),
         passes.IdentityEliminationPass(),
         passes.CommonSubexpressionEliminationPass(),
         passes.RemoveUnusedNodesPass(),
@@ -227,8 +214,7 @@ def _shorten(model: onnx_ir.Model) -> None:
 
     There they are needed by onnxruntime: it names new values after nodes, and without them its optimised copy of a file
     has the same names in several subgraphs. Types and shapes of intermediate values are also removed, because they
-    would be most of the file; inference finds them. Those of convolutions stay: onnxruntime finds too few, and adds
-    sums of convolutions within the last of them only if it knows that their sizes are equal.
+    would be most of the file; inference finds them.
     """
     interface_names = {value.name for value in (*model.graph.inputs, *model.graph.outputs)}
     values: list[onnx_ir.Value] = []
@@ -239,7 +225,7 @@ def _shorten(model: onnx_ir.Model) -> None:
             node.name = None if graph is model.graph else f"_{next(names_of_nodes)}"  # not a name of a value
             values += node.outputs
             for value in node.outputs:
-                if not value.is_graph_output() and not (node.op_type == "Conv" and sizes(value)):
+                if not value.is_graph_output():
                     value.shape = value.type = None
     values = sorted((v for v in values if v.name not in interface_names), key=lambda v: -len(v.uses()))
     for value, name in zip(values, (name for name in _names() if name not in interface_names), strict=False):

@@ -46,12 +46,9 @@ def last(step: Tensor, before: Tensor, after: Tensor) -> Tensor:
     return operator(_LAST, [after, step, before], after.shape)
 
 
-def operator(
-    name: str, inputs: Sequence[Tensor], shape: Sequence[int | torch.SymInt], numbers: dict[str, float] | None = None
-) -> Tensor:
-    """An operator of ONNX in a graph, with attributes; its result has the dtype of its first input."""
-    attributes: Any = numbers
-    return torch.onnx.ops.symbolic(name, inputs, attributes, dtype=inputs[0].dtype, shape=list(shape))
+def operator(name: str, inputs: Sequence[Tensor], shape: Sequence[int | torch.SymInt]) -> Tensor:
+    """An operator of ONNX in a graph; its result has the dtype of its first input."""
+    return torch.onnx.ops.symbolic(name, inputs, dtype=inputs[0].dtype, shape=list(shape))
 
 
 def structure(model: onnx_ir.Model) -> None:

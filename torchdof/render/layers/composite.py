@@ -174,8 +174,7 @@ def _composite_layers(frame: PaddedFrame, blurs: Sequence[LayerKernel], scatter:
         if is_before_focus and has_stand_ins:
             has_stand_ins = False
             light, share = frame.stand_ins()
-            front = torch.cat(in_front((light, 1.0 - share if backed else share), _parts(picture, colours)), 1)
-            picture = ops.equal_unless(frame.any_stand_in, front, picture)
+            picture = torch.cat(in_front((light, 1.0 - share if backed else share), _parts(picture, colours)), 1)
         part = picture
         if scale > 1:  # one more pixel on each side, for the interpolation
             part = blank(*(n // scale + 2 for n in frame.area))
@@ -185,8 +184,10 @@ def _composite_layers(frame: PaddedFrame, blurs: Sequence[LayerKernel], scatter:
         if scale > 1:
             fine = upsampled(part, scale)
             fine = fine[..., scale:-scale, scale:-scale]
-            part = torch.cat(in_front(_parts(fine, colours), _parts(picture, colours)), 1)
-        picture = ops.equal_unless(_needed(frame, blurs, [k for group in groups for k in group]), part, picture)
+            needed = _needed(frame, blurs, [k for group in groups for k in group])
+            together = torch.cat(in_front(_parts(fine, colours), _parts(picture, colours)), 1)
+            part = ops.equal_unless(needed, together, picture)
+        picture = part
     return picture
 
 

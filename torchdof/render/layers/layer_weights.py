@@ -23,7 +23,7 @@ from torch import Tensor
 
 _SQUARE_PX = 0.5  # px of coc around which x changes from the square of the coc to the coc itself
 _IN_FOCUS = 2e-4  # x below which a pixel is in focus, at a coc of 0.01 px; larger: more pixels pass unchanged
-FOOT = 0.15  # weight up to which an eased ramp is a parabola; larger: it leaves 0 more slowly
+_FOOT = 0.15  # weight up to which an eased ramp is a parabola; larger: it leaves 0 more slowly
 
 
 def blur_axis(coc_px: Tensor) -> Tensor:
@@ -76,6 +76,6 @@ def weights_at_or_behind(x: Tensor, ramps: Tensor) -> Tensor:
 
 def eased(weight: Tensor) -> Tensor:
     """A ramp from 0 to 1 whose foot is a parabola, so that it leaves 0 slowly."""
-    slope = 1.0 / (1.0 - 0.5 * FOOT)
-    foot = weight.clamp(max=FOOT)
-    return torch.maximum(1.0 - slope * (1.0 - weight), (0.5 * slope / FOOT) * foot * foot)
+    slope = 1.0 / (1.0 - 0.5 * _FOOT)
+    foot = weight.clamp(max=_FOOT)
+    return torch.maximum(1.0 - slope * (1.0 - weight), (0.5 * slope / _FOOT) * foot * foot)

@@ -36,7 +36,7 @@ _FALL = 0.35  # weight of a level relative to the next finer one; larger: hidden
 _FINE_LEVELS = 2  # levels that each pixel reads; coarser ones are read once per cell of 2**_FINE_LEVELS pixels
 _SURE = 0.1  # weight of the samples of a level at which its vote is full
 _LEAST_SEEN = 1e-4  # weight of samples up to which they count as empty
-LEAST_TOTAL = 1e-9  # smallest divisor of sums of light
+_LEAST_TOTAL = 1e-9  # smallest divisor of sums of light
 _MIXED = 0.05  # share above which the second surface of a pixel counts; larger: fewer mixed pixels
 _HIDING_FROM_PX = 0.5  # px: pixels blurred less hide nothing that is seen
 _CERTAIN = 0.01  # votes at which a hidden sample has full weight, or a farther surface replaces a nearer one
@@ -367,7 +367,7 @@ def _farthest(values: Tensor) -> Tensor:
 
 def _level_of(summed: Tensor, total: Tensor) -> Tensor:
     """Light, coc and weight of a level, of the weighted sums of light and coc, ``[B, C + 1, h, w]``, and the weight."""
-    light, coc_px = (summed / total.clamp_min(LEAST_TOTAL)).split([summed.shape[1] - 1, 1], 1)
+    light, coc_px = (summed / total.clamp_min(_LEAST_TOTAL)).split([summed.shape[1] - 1, 1], 1)
     return torch.cat([light, torch.where(total > 0, coc_px, -NEVER_PX), total], 1)
 
 
@@ -486,11 +486,6 @@ def mean_behind(summed: Tensor, total: Tensor) -> Seen:
     return summed / total.clamp_min(_LEAST_SEEN), total
 
 
-def votes_of(looked: Tensor, weight: Tensor, slope: Tensor, most: Tensor) -> Tensor:
-    """Votes of samples of a weight that are read by a part ``looked``, with the numbers of their :class:`Level`."""
-    return looked * torch.minimum(weight * slope, most)
-
-
 def search(levels: Sequence[Level], shown: Tensor, weight: Tensor, coc_px: Tensor, farthest: bool = False) -> Seen:
     """Mean over levels of the light and coc behind a map; with ``farthest``, of the farthest surface only.
 
@@ -507,10 +502,10 @@ def search(levels: Sequence[Level], shown: Tensor, weight: Tensor, coc_px: Tenso
     numbers = _numbers_of(tuple(level[2:] for level in levels), coc_px.dtype, coc_px.device)
     least, slope, most = (numbers[i, :, None, None, None, None] for i in range(3))
     looked = is_read(coc_px, least)
-    votes = votes_of(looked, weight, slope, most)
+    votes = looked * torch.minimum(weight * slope, most)
     if not farthest:
         total = votes.sum(0)
-        return (shown * votes).sum(0) / total.clamp_min(LEAST_TOTAL), total
+        return (shown * votes).sum(0) / total.clamp_min(_LEAST_TOTAL), total
     sure = (looked * weight / _CERTAIN).clamp(max=1.0)
     total, seen = votes[0], shown[0]
     for k in range(1, len(levels)):
@@ -518,7 +513,7 @@ def search(levels: Sequence[Level], shown: Tensor, weight: Tensor, coc_px: Tenso
         apart, vote = beyond[:, -1:], votes[k]
         vote = torch.where(total > 0, vote * (1.0 - is_another_surface(-apart)), vote)
         total = total * (1.0 - sure[k] * is_another_surface(apart)) + vote
-        seen = seen + beyond * (vote / total.clamp_min(LEAST_TOTAL))
+        seen = seen + beyond * (vote / total.clamp_min(_LEAST_TOTAL))
     return seen, total
 
 

@@ -21,7 +21,7 @@ from .border import continued, repeated
 HIDDEN_WEIGHT = 0.003
 """Weight of a hidden sample, which is guessed; a visible one has 1. A larger value mixes more guessed light in."""
 
-HIDING_SHARE = 0.06
+_HIDING_SHARE = 0.06
 """Share of a surface at or behind a layer at which it counts there in full; larger: it fades in over more depth."""
 _LEAST_PASSING = 1e-6  # smallest divisor: share of the light that passes the part of a surface in front of a layer
 _CONTINUES_FROM = 0.1
@@ -165,10 +165,6 @@ class PaddedFrame:
         surfaces = [PaddedSurface(*(self.cut(t.unsqueeze(1), halo) for t in s if t is not None)) for s in self.surfaces]
         return (_stacked if self.stacked else _mixed)(surfaces, pairs)
 
-    def any_stand_in(self) -> Tensor:
-        """Whether a pixel of the area may have a stand-in: a bool ``[]``."""
-        return self.any_between(-2.0 * _BARELY_BLURRED, 0.0, 0)
-
     def stand_ins(self) -> tuple[Tensor, Tensor]:
         """Stand-ins for the picture at and behind the focus: light ``[B, C, h, w]`` and cover ``[B, 1, h, w]``.
 
@@ -224,7 +220,7 @@ def continuation_weight(cover: Tensor) -> Tensor:
 
 def visible_part(nearer: Tensor) -> Tensor:
     """Part of that coverage that counts in a layer, where ``nearer`` is the near surface's share at or behind it."""
-    return 1.0 - (nearer / HIDING_SHARE).clamp(0.0, 1.0)
+    return 1.0 - (nearer / _HIDING_SHARE).clamp(0.0, 1.0)
 
 
 def _mixed(surfaces: Sequence[PaddedSurface], pairs: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
@@ -255,7 +251,7 @@ def _stacked(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """``m_k I``, ``m_k`` and ``M_k - m_k`` of surfaces that cover a pixel independently, near to far.
 
-    With ``c`` the cover of a surface, ``b`` its share at or behind layer k, ``f`` the share :data:`HIDING_SHARE` and
+    With ``c`` the cover of a surface, ``b`` its share at or behind layer k, ``f`` the share :data:`_HIDING_SHARE` and
     ``h = c eased(min(b / f, 1))``,
 
         ``M_k = prod(1 - h (1 - b)) (1 - prod(1 - h))``,
@@ -268,7 +264,7 @@ def _stacked(
     stopped = []
     for (_, x, weight), (behind, beyond) in zip(surfaces, pairs, strict=True):
         cover = torch.ones_like(x) if weight is None else weight
-        here = cover * eased((behind / HIDING_SHARE).clamp(max=1.0))
+        here = cover * eased((behind / _HIDING_SHARE).clamp(max=1.0))
         passes = 1.0 - here * (1.0 - behind)  # share not hidden by the surface's part in front of layer k
         # share of the arriving light stopped in layer k
         stops = cover * (behind - beyond) / passes.clamp_min(_LEAST_PASSING)
