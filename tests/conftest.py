@@ -27,7 +27,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # one core for each worker and its subp
 
 
 # Folders and files with long tests. They start first: a worker without tests then takes short ones from the other.
-LONG = ("tests/examples/test_web_files.py", "tests/export/", "tests/fit/")
+LONG = ("tests/export/", "tests/fit/")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

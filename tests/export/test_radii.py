@@ -39,10 +39,11 @@ def written(folder: Path, radius: float, family: str, tolerance: float, layout: 
 
 
 @pytest.mark.parametrize(("radius", "family", "tolerance", "layout"), [
-    (11.7, "gaussian", 8, "tiles"),
+    (64.0, "gaussian", 16, "tiles"),  # the radius of the files of the web page
+    pytest.param(11.7, "gaussian", 8, "tiles", marks=pytest.mark.sweep),
     pytest.param(33.0, "lens", 16, "whole", marks=pytest.mark.sweep),
     pytest.param(29.3, "softm", 24, "tiles", marks=pytest.mark.sweep),
-    pytest.param(57.1, "disc", 48, "tiles", marks=pytest.mark.sweep),  # examples/test_web_files.py: 64 px
+    pytest.param(57.1, "disc", 48, "tiles", marks=pytest.mark.sweep),
 ])  # fmt: skip
 def test_a_file_of_wide_kernels_is_verified(
     tmp_path: Path, radius: float, family: str, tolerance: float, layout: Layout

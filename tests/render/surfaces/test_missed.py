@@ -35,7 +35,7 @@ def test_a_map_that_needs_no_repair_stays(engine: str) -> None:
 
 
 def test_things_of_the_background_are_left_to_it(engine: str) -> None:
-    """Fur behind a post: what is unlike the background is as frequent away from the edge as beside it."""
+    """Fur behind a post: unlike pixels are as frequent away from the edge as beside it."""
     image = furry_post()[0]
     given = torch.where(pixels_from_post(160) < 0, -12.0, 0.5).expand(1, 1, 224, -1).contiguous()
     strands = torch.rand(1, 1, 224, 1, generator=torch.Generator().manual_seed(1)) < 0.4

@@ -21,7 +21,7 @@ constexpr int RIM = constants::missed::RIM;
 constexpr int SAMPLED = constants::missed::SAMPLED;
 constexpr int REACH = constants::missed::REACH;
 constexpr int CELL = constants::missed::CELL;
-constexpr int AROUND = constants::missed::AROUND;
+constexpr int NEARBY = constants::missed::NEARBY;
 constexpr int PLACE = constants::missed::PLACE;
 constexpr float APART_PX = constants::missed::APART_PX;
 constexpr float SHARPER = constants::missed::SHARPER;
@@ -238,7 +238,7 @@ class Missed {
   // Means around cells, of sums of background(): weight; light, its square; coc, its square. The squares become one
   // over the variance of light, and the standard deviation of coc.
   std::vector<float> described(std::vector<float> planes) const {
-    around_(planes, AROUND);
+    around_(planes, NEARBY);
     parallel(map_.threads, rows_, map_.cancelled, [&](int y, int) {
       float *const seen = &planes[(size_t)y * columns_], *const light = seen + cells_;
       float *const square = light + channels_ * cells_, *const coc = square + cells_, *const coc_square = coc + cells_;

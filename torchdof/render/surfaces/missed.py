@@ -24,10 +24,10 @@ _SHARPER = 0.7  # largest blur of a pixel beyond an edge, over that of the near 
 _APART_PX = 2.0  # px; subtracted from it; larger: fewer edges
 _RINGS_PX = (1, 2, 3, 7, 14)  # px; distance from the near surface at which each ring ends
 _RIM = 3  # rings in which the map may have missed something; the first is mixed by the image itself
-_SAMPLED = 2  # rows; every so many are compared; larger: faster, coarser
+_SAMPLED = 2  # every second row is compared; larger: faster, coarser
 _REACH = 10  # px; farthest part that is given to the near surface; larger: longer hairs
 _CELL = 4  # px; side of the cells in which pixels are summed
-_AROUND = 2  # cells; half the width of the window of the background around a pixel; larger: smoother backgrounds
+_NEARBY = 2  # cells; half the width of the window of the background around a pixel; larger: smoother backgrounds
 _PLACE = 12  # cells; half the width of the window in which pixels are counted; larger: fewer wrong places
 _GRAIN = 4e-4  # least variance of the square root of light, over its square; larger: fewer pixels are unlike
 _OUTLIER = 9.0  # squared deviation at which a sample of the background counts by a quarter
@@ -38,7 +38,7 @@ _MISSED = 0.25  # share of unlike pixels, above that of the background, from whi
 _COUNTED = 200.0  # sampled pixels of a rim from which the share counts in full; larger: fewer wrong places
 _COMPARED = 0.2  # fewest background pixels, over those of the rim
 _ON_SURFACE = 0.25  # deviation of the coc of samples, over the difference of both surfaces, up to which they are one
-_LEAST_SAMPLES = 0.005  # fraction of the window that samples fill
+_LEAST_SAMPLES = 0.006  # fraction of the window that samples fill
 _FAR_PX = 1e9  # px; a coc that marks pixels without a near surface
 _LARGEST_PX = 1e6  # px; largest valid coc, whose square is exact enough
 _BRIGHTEST = 1e15  # largest light that is compared
@@ -134,7 +134,7 @@ def _is_beyond(blur: Tensor, near: Tensor) -> Tensor:
     return blur < _SHARPER * near - _APART_PX
 
 
-# What is computed depends on the data, which compiled graphs do not support.
+# Compiled graphs do not support steps that depend on the data.
 @one_operator("torchdof::missed_parts", lambda image, coc_px, is_inexact: coc_px.new_empty(coc_px.shape))
 def _operator(image: Tensor, coc_px: Tensor, is_inexact: Tensor) -> Tensor:
     return _completed(image, coc_px, is_inexact, EAGER).clone(memory_format=torch.contiguous_format)
@@ -143,7 +143,7 @@ def _operator(image: Tensor, coc_px: Tensor, is_inexact: Tensor) -> Tensor:
 def _compared(light: Tensor, coc: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Squared deviation of each pixel from weighted samples around it, mean and variance of their coc, their weight."""
     colours, square = light.shape[1], light.square().mean(1, keepdim=True)
-    sums = _around(weight * torch.cat([torch.ones_like(coc), light, square, coc, coc * coc], 1), _AROUND)
+    sums = _around(weight * torch.cat([torch.ones_like(coc), light, square, coc, coc * coc], 1), _NEARBY)
     seen, means = sums.split([1, colours + 3], 1)
     mean, square, middle, of_coc = (means / seen.clamp_min(1e-9)).split([colours, 1, 1, 1], 1)
     bright = mean.square().mean(1, keepdim=True)
