@@ -14,13 +14,16 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from torchdof.render.layers import composite, layer_weights
-from torchdof.render.surfaces import disocclusion, frame
+from torchdof.render.surfaces import disocclusion, frame, matting
 
 ROOT = Path(__file__).parents[2]
 COMPILER = os.environ.get("CXX") or shutil.which("c++")
 
 # C++ expression of a float x or a vector v of it -> the same in Python; of 0.3 px the level is read
 RULES: dict[str, Callable[[Tensor], Tensor]] = {
+    "apart_px(v, broadcast(0.7f))[0]": lambda x: matting._apart_px(x, torch.full_like(x, 0.7)),
+    "on_near(v)[0]": matting._on_near,
+    "on_far(v)[0]": matting._on_far,
     "end_of_surface(x)": disocclusion.end_of_surface,
     "is_another_surface(x)": disocclusion.is_another_surface,
     "is_another_surface(v)[0]": disocclusion.is_another_surface,

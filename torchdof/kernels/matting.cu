@@ -205,7 +205,7 @@ __device__ inline void moved_back(const Run &r, const Pixel &p, const Split &s, 
     of.far_light[c] += s.by_owner(of_other_mean, of_own_mean);
   }
   // lent = 1 - sharper, sharper = |coc| - |coc of the other surface|
-  const float of_sharper = is_within(1 - s.sharper) ? -of_lent : 0.0f;
+  const float of_sharper = within(1 - s.sharper) ? -of_lent : 0.0f;
   of.coc += of_sharper * sign(s.coc);
   of.near -= s.is_near ? 0.0f : of_sharper * sign(s.ends.near);
   of.far -= s.is_near ? of_sharper * sign(s.ends.far) : 0.0f;
@@ -225,11 +225,11 @@ __device__ inline void weight_back(const Run &r, const Pixel &p, const Split &s,
   of.covered += of_off + s.by_owner(-of_cover, of_cover);
   float of_fitted = s.by_owner(-of_fit, of_fit) - of_off;
   of.edge += of_clear * clamp01(4 * s.sided() - 2);
-  const float of_sided = is_within(4 * s.sided() - 2) ? 4 * of_clear * s.edge / s.gap : 0.0f;
+  const float of_sided = within(4 * s.sided() - 2) ? 4 * of_clear * s.edge / s.gap : 0.0f;
   of.coc += 2 * sign(s.side) * of_sided;
   of.near -= sign(s.side) * of_sided;
   of.far -= sign(s.side) * of_sided;
-  of.gap += (is_within(s.wide) ? of_by_place * cover * s.clear * doubt / EDGE_PX : 0.0f) - of_sided * s.sided();
+  of.gap += (within(s.wide) ? of_by_place * cover * s.clear * doubt / EDGE_PX : 0.0f) - of_sided * s.sided();
   const float of_total = -of_trust * s.trust / s.total, of_misfit = of_contradiction + of_total * TRUST;
   float of_strength = of_trust / s.total + of_total + of_contradiction * off * off;
   of.variance += of_total * TRUST + of_agreeing * (1 - agreeing);
@@ -237,7 +237,7 @@ __device__ inline void weight_back(const Run &r, const Pixel &p, const Split &s,
     const float left = s.light(r, p, c) - s.seen.far[c] - s.fitted * s.seen.contrast(c);
     of_fitted -= 2 * of_misfit * left * s.seen.contrast(c);
   }
-  const float of_along = is_within(s.along) ? of_fitted / torchdof::max(s.strength, LEAST) : 0.0f;
+  const float of_along = within(s.along) ? of_fitted / torchdof::max(s.strength, LEAST) : 0.0f;
   if (s.strength >= LEAST) of_strength -= of_along * s.along;
   EACH_CHANNEL {
     const float contrast = s.seen.contrast(c), from_far = s.light(r, p, c) - s.seen.far[c];
@@ -278,7 +278,7 @@ extern "C" __global__ void __launch_bounds__(TILE_ROWS * TILE_COLUMNS) split_bac
       of_contrast[c] -= of_seen * l.limited;
       parts.at(c, i) = of_seen;
     }
-    of_share = is_within(n.nearer > n.farther ? -l.share : l.share) ? of_share * s.per_strength : 0.0f;
+    of_share = within(n.nearer > n.farther ? -l.share : l.share) ? of_share * s.per_strength : 0.0f;
     of_strength -= of_share * l.share;
     EACH_CHANNEL of_contrast[c] += of_share * (l.value[c] - l.clean[c]);
     parts.at(OF_CLEAN, i) = of_share;  // for the next loop, as these two
@@ -300,8 +300,8 @@ extern "C" __global__ void __launch_bounds__(TILE_ROWS * TILE_COLUMNS) split_bac
       parts.at(c, i) = of_light * s.per_scale;
       parts.at(OF_CLEAN + c, i) = absolute(r.clean[n.pixel.in(r, CHANNELS, c)] * s.per_scale) <= MOST_CLEAN ? of_clean * s.per_scale : 0.0f;
     }
-    const float near = 4 * n.nearness - 2.8f, far = 1.2f - 4 * n.nearness, valid = counts(r, n.pixel);
-    const float of_sides = (is_within(near) ? of_nearer : 0.0f) - (is_within(far) ? of_farther : 0.0f);
+    const float near = torchdof::unlimited_on_near(n.nearness), far = torchdof::unlimited_on_far(n.nearness), valid = counts(r, n.pixel);
+    const float of_sides = (within(near) ? of_nearer : 0.0f) - (within(far) ? of_farther : 0.0f);
     const float of_nearness = (4 * n.unmixed * of_sides + of.covered * falloff(i, SMALL_BESIDE) * valid * s.per_counted) / s.gap;
     of.far += of_nearness;
     of.gap -= of_nearness * n.nearness;
@@ -349,13 +349,13 @@ extern "C" __global__ void find_clean_back(const __grid_constant__ Run r) {
   TAP_BY_TAP for (int i = 0; i < TAPS; i++) {
     const Pixel q = p.around(r, i);
     const float apart = s.apart(r, q), alike = s.alike(apart), weight = s.weight(r, q, i);
-    float of_weight = is_within(s.enough) ? of_taken * s.edge : 0.0f;
+    float of_weight = within(s.enough) ? of_taken * s.edge : 0.0f;
     EACH_CHANNEL {
       const float of_mean = of_clean[c] * s.taken() / s.total;
       of_weight += of_mean * (light_of(r, q, c) - s.mean[c]);
       parts.at(c, i) = of_mean * weight + (i == MIDDLE ? of_clean[c] - of_clean[c] * s.taken() : 0.0f);
     }
-    const float of_apart = is_within(alike) ? -2 * sign(apart) * of_weight * unmixed(r, q, i) / EDGE_PX : 0.0f;
+    const float of_apart = within(alike) ? -2 * sign(apart) * of_weight * unmixed(r, q, i) / EDGE_PX : 0.0f;
     parts.at(OF_EDGE, i) = (i == MIDDLE ? of_taken * clamp01(s.enough) : 0.0f) - of_weight * clamp01(alike) * falloff(i, BESIDE) * counts(r, q);
     parts.at(OF_COC, i) = of_apart;
     of_coc -= of_apart;
@@ -377,9 +377,9 @@ extern "C" __global__ void find_edges_back(const __grid_constant__ Run r) {
   }
   if (!(edge_of(r, p) > 0)) return;
   const Ends e = ends_of(r, p);
-  const float slope = is_within(e.apart() / EDGE_PX - 1) ? r.of_values[p.in(r, VALUES, OF_EDGE)] / EDGE_PX : 0.0f;
+  const float slope = within(e.apart() / EDGE_PX - 1) ? r.of_values[p.in(r, VALUES, OF_EDGE)] / EDGE_PX : 0.0f;
   // the smaller of both blurs is that of one surface, or of both by halves
-  const float near = absolute(e.near), far = absolute(e.far), of_blur = -SAME_BLUR * slope * (near == far ? 0.5f : 1.0f);
+  const float near = absolute(e.near), far = absolute(e.far), of_blur = -torchdof::SAME_BLUR * slope * (near == far ? 0.5f : 1.0f);
   const Parts parts(r, p);
   TAP_BY_TAP for (int i = 0; i < TAPS; i++) parts.at(OF_COC, i) = 0;
   parts.add_ends(r, p, e, (near <= far ? of_blur * sign(e.near) : 0.0f) - slope, (far <= near ? of_blur * sign(e.far) : 0.0f) + slope);

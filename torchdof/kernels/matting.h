@@ -1,12 +1,13 @@
 // What the kernels of matting.cu work on: maps, pixels, and the small rules of edges and of clean light.
 #pragma once
 #include "constants/matting.h"
-#include "numbers.h"
+#include "rules.h"
 
 using torchdof::clamp01;
+using torchdof::TINY;
+using torchdof::within;
 
 constexpr float EDGE_PX = torchdof::constants::matting::EDGE_PX;
-constexpr float SAME_BLUR = torchdof::constants::matting::SAME_BLUR;
 constexpr float BESIDE = torchdof::constants::matting::FALLOFF;
 constexpr float UNCLEAN = torchdof::constants::matting::UNCLEAN;
 constexpr float TRUST = torchdof::constants::matting::TRUST;
@@ -17,7 +18,6 @@ constexpr float ALIKE = torchdof::constants::matting::ALIKE;
 constexpr float UNBOUNDED = torchdof::constants::matting::UNBOUNDED;
 constexpr float NEVER_PX = torchdof::constants::matting::NEVER_PX;
 constexpr float LEAST = 1e-12f;          // smallest divisor
-constexpr float TINY = 1.17549435e-38f;  // smallest light that is a divisor: the smallest normal number
 
 constexpr int TILE_ROWS = 4, TILE_COLUMNS = 32;  // a block of threads, as in matting.py
 constexpr int TAPS = 9, MIDDLE = TAPS / 2;       // pixels around one, row by row
@@ -77,17 +77,16 @@ struct Pixel {
 
 __device__ inline float absolute(float v) { return torchdof::max(v, -v); }
 __device__ inline float sign(float v) { return v > 0 ? 1.0f : v < 0 ? -1.0f : 0.0f; }
-__device__ inline bool is_within(float v) { return v >= 0 && v <= 1; }
 __device__ inline float falloff(int i, float beside) { return i == MIDDLE ? 1.0f : i % 2 ? beside : beside * beside; }
 __device__ inline float coc_of(const Run &r, const Pixel &p) { return r.coc[p.in(r, 1, 0)]; }
 __device__ inline float edge_of(const Run &r, const Pixel &p) { return r.edge[p.in(r, 1, 0)]; }
 __device__ inline float light_of(const Run &r, const Pixel &p, int c) { return r.light[p.in(r, CHANNELS, c)]; }
 __device__ inline float counts(const Run &r, const Pixel &p) { return r.valid ? r.valid[p.in(r, 1, 0)] : 1.0f; }
 
-// The coc of the nearest and the farthest pixel around, and the difference of both, less the part that is not seen in a strong blur.
+// The coc of the nearest and the farthest pixel around.
 struct Ends {
   float near, far;
-  __device__ float apart() const { return far - near - SAME_BLUR * torchdof::min(absolute(near), absolute(far)); }
+  __device__ float apart() const { return torchdof::apart_px(near, far); }
 };
 __device__ inline Ends ends_of(const Run &r, const Pixel &p) {
   Ends e = {NEVER_PX, -NEVER_PX};

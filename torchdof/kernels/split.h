@@ -38,8 +38,8 @@ struct Split {
     Neighbour n = {p.around(r, i), 0, 0, 0, 0};
     n.nearness = (ends.far - coc_of(r, n.pixel)) / gap;  // a division: the limits enlarge rounding
     n.unmixed = unmixed(r, n.pixel, i);
-    n.nearer = n.unmixed * clamp01(4 * n.nearness - 2.8f);
-    n.farther = n.unmixed * clamp01(1.2f - 4 * n.nearness);
+    n.nearer = n.unmixed * torchdof::on_near(n.nearness);
+    n.farther = n.unmixed * torchdof::on_far(n.nearness);
     return n;
   }
   __device__ Light light(const Run &r, const Neighbour &n) const {

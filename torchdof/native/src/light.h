@@ -3,9 +3,10 @@
 #include <algorithm>
 #include <cstddef>
 
+#include "numbers.h"
+
 namespace torchdof {
 
-constexpr float TINY = 1.17549435e-38f;  // lower limit where light is the divisor
 // Largest channel of a pixel's light; the channels lie `step` values apart.
 inline float peak_of(const float *light, size_t step, int channels) {
   float peak = *light;

@@ -28,7 +28,6 @@ namespace {
 
 // Constants of matting.py and pipeline.py in render, which give their meanings, units and effects.
 constexpr float EDGE_PX = constants::matting::EDGE_PX;
-constexpr float SAME_BLUR = constants::matting::SAME_BLUR;
 constexpr float UNCLEAN = constants::matting::UNCLEAN;
 constexpr float TRUST = constants::matting::TRUST;
 constexpr float TEXTURE = constants::matting::TEXTURE;
@@ -48,7 +47,7 @@ constexpr int EDGES = BLOCK + 2 * RIM;    // of the windows of edges and light
 constexpr int PITCH = 24;                 // of all
 
 // How clearly two cocs around a pixel are those of two surfaces: none from 0 down, in full from 1 on.
-vec edge_of(vec near, vec far) { return (far - near - SAME_BLUR * min(abs(near), abs(far))) * (1.0f / EDGE_PX) - 1.0f; }
+vec edge_of(vec near, vec far) { return apart_px(near, far) * (1.0f / EDGE_PX) - 1.0f; }
 
 // Falloff of the Gaussian by which two surfaces mix, beside its centre.
 constexpr float SMALL_BESIDE = constants::matting::SOFTNESS_FALLOFF;
@@ -147,8 +146,6 @@ bool find_edges(const Frame &frame, int y0, int x0, Window &w) {
 inline int tap(int i) { return i / AROUND * PITCH + i % AROUND; }
 inline vec select(ivec where, vec value) { return where ? value : vec{}; }
 inline void add(float *to, vec value) { store(to, load<vec>(to) + value); }
-// Where a value is not limited by clamp01, so that it has a gradient.
-inline ivec is_within(vec value) { return (value >= vec{}) & (value <= 1.0f); }
 
 // The nearest and farthest coc of the 3 x 3 pixels from a place of a window on.
 struct Ends {
@@ -234,9 +231,9 @@ void clean_light(const Frame &frame, int y0, int x0, Window &w, const float *fal
       if (!slopes) continue;
       add(slopes->edge + at, d_is_clean * clamp01(enough));
       for (int k = 0; k < TAPS; k++) {
-        const vec slope = d_weight[k] + select(is_within(enough), d_is_clean * edge);
+        const vec slope = d_weight[k] + select(within(enough), d_is_clean * edge);
         add(slopes->edge + first + tap(k), -slope * clamp01(alike[k]) * near_by[k]);
-        const vec d_apart = select(is_within(alike[k]), slope * unmixed[k] * (-2.0f / EDGE_PX)) *
+        const vec d_apart = select(within(alike[k]), slope * unmixed[k] * (-2.0f / EDGE_PX)) *
                             (select(apart[k] > vec{}, broadcast(1.0f)) - select(apart[k] < vec{}, broadcast(1.0f)));
         add(slopes->coc + at + tap(k), d_apart);
         d_middle -= d_apart;
@@ -378,8 +375,8 @@ class Split {
       const vec weight = (broadcast(1.0f + UNCLEAN) - load<vec>(w_.edge + first_ + tap(i))) * falloff_[i] * valid_[i];
       const vec nearness = (ends_.far - load<vec>(w_.coc + in_coc_ + tap(i))) /
                            gap_;  // not times 1 / gap, whose rounding the clamps below enlarge
-      nearer_[i] = weight * clamp01(4.0f * nearness - 2.8f);
-      farther_[i] = weight * clamp01(1.2f - 4.0f * nearness);
+      nearer_[i] = weight * on_near(nearness);
+      farther_[i] = weight * on_far(nearness);
       small_[i] = (i == TAPS / 2 ? 1.0f : i % 2 ? SMALL_BESIDE : SMALL_DIAGONAL) * valid_[i];
       covered_ += small_[i] * nearness, counted += small_[i];
     }
@@ -496,7 +493,7 @@ class Split {
     const auto sign = [](vec value) {
       return select(value > vec{}, broadcast(1.0f)) - select(value < vec{}, broadcast(1.0f));
     };
-    const vec d_sharper = select(is_within(sharper_), -d_lent),
+    const vec d_sharper = select(within(sharper_), -d_lent),
               d_other = -d_sharper * sign(is_near_ ? ends_.far : ends_.near);
     d_here_ = d_sharper * sign(here_);
     d_near_ += select(~is_near_, d_other), d_far_ += select(is_near_, d_other);
@@ -519,10 +516,10 @@ class Split {
     d_edge_ = d_clear * clamp01(4.0f * sided_ - 2.0f);
     const vec signed_side = (here_ - ends_.near) - (ends_.far - here_),
               side = select(signed_side > vec{}, broadcast(1.0f)) - select(signed_side < vec{}, broadcast(1.0f));
-    const vec d_sided = select(is_within(4.0f * sided_ - 2.0f), d_clear * edge_ * 4.0f) / gap_;
+    const vec d_sided = select(within(4.0f * sided_ - 2.0f), d_clear * edge_ * 4.0f) / gap_;
     d_here_ += 2.0f * side * d_sided;
     d_near_ -= side * d_sided, d_far_ -= side * d_sided;
-    d_gap_ = select(is_within(wide_), d_geometric * by_cover * clear_ * doubt * (1.0f / EDGE_PX)) - d_sided * sided_;
+    d_gap_ = select(within(wide_), d_geometric * by_cover * clear_ * doubt * (1.0f / EDGE_PX)) - d_sided * sided_;
     const vec d_total = -d_trust * trust_ / total_, d_noisy = d_total * TRUST;
     vec d_strength = d_trust / total_ + d_total + d_contradiction * off * off;
     const vec d_misfit = d_contradiction + d_noisy;
@@ -534,7 +531,7 @@ class Split {
       d_behind_[c] -= d_left;
       d_fitted -= d_left * contrast;
     }
-    const vec d_along = select(is_within(along_), d_fitted) / max(strength_, broadcast(1e-12f));
+    const vec d_along = select(within(along_), d_fitted) / max(strength_, broadcast(1e-12f));
     d_strength -= select(strength_ >= broadcast(1e-12f), d_along * along_);
     const vec d_misfit_contrast = 2.0f * d_misfit * fitted_;
     for (int c = 0; c < C(); c++) {
@@ -566,7 +563,7 @@ class Split {
         d_contrast_[c] -= d_light_[c * TAPS + i] * shift;
         along += off * contrast;
       }
-      d_shift = select(is_within(nearer_[i] > farther_[i] ? -shift_[i] : shift_[i]), d_shift);
+      d_shift = select(within(nearer_[i] > farther_[i] ? -shift_[i] : shift_[i]), d_shift);
       d_per_strength += d_shift * along;
       d_shift *= per_strength_;
       for (int c = 0; c < C(); c++) {
@@ -602,11 +599,10 @@ class Split {
       const int in_coc = in_coc_ + tap(i);
       const vec near_by = falloff_[i] * valid_[i],
                 weight = (broadcast(1.0f + UNCLEAN) - load<vec>(w_.edge + first_ + tap(i))) * near_by;
-      const vec nearness = (ends_.far - load<vec>(w_.coc + in_coc)) / gap_, to_near = 4.0f * nearness - 2.8f,
-                to_far = 1.2f - 4.0f * nearness;
+      const vec nearness = (ends_.far - load<vec>(w_.coc + in_coc)) / gap_, to_near = unlimited_on_near(nearness),
+                to_far = unlimited_on_far(nearness);
       add(slopes.edge + first_ + tap(i), -near_by * (d_nearer[i] * clamp01(to_near) + d_farther[i] * clamp01(to_far)));
-      const vec d_ends =
-          4.0f * weight * (select(is_within(to_near), d_nearer[i]) - select(is_within(to_far), d_farther[i]));
+      const vec d_ends = 4.0f * weight * (select(within(to_near), d_nearer[i]) - select(within(to_far), d_farther[i]));
       const vec d_nearness = (d_ends + d_covered_ * small_[i] * per_counted_) / gap_;
       add(slopes.coc + in_coc, -d_nearness);
       d_far_ += d_nearness;
@@ -704,7 +700,7 @@ void back_of_block(const Frame &frame, int by, int bx, Window &w, const float *f
       const Ends ends(w, at, frame.valid);
       const vec rise = edge_of(ends.near, ends.far);
       const vec slope =
-          select(is_within(rise) & (load<vec>(w.edge + at) > vec{}), load<vec>(slopes.edge + at) * (1.0f / EDGE_PX));
+          select(within(rise) & (load<vec>(w.edge + at) > vec{}), load<vec>(slopes.edge + at) * (1.0f / EDGE_PX));
       // the smaller of both blurs is that of one surface, or of both by halves
       const vec near_blur = abs(ends.near), far_blur = abs(ends.far);
       const vec part = SAME_BLUR * slope * (near_blur == far_blur ? broadcast(0.5f) : broadcast(1.0f));

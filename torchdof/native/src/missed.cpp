@@ -68,47 +68,13 @@ vec least_of(const float *at, int stride, int reach) {
   return min(min(before, load<vec>(at - reach * stride)), after);
 }
 
-// Means over windows of 2 * reach + 1 cells in planes of sums, of which cells beyond the frame are 0.
-class Around {
- public:
-  Around(const torchdof_map &map, int rows, int columns) : map_(map), rows_(rows), columns_(columns) {}
-
-  void operator()(std::vector<float> &planes, int reach) const {
-    const size_t cells = (size_t)rows_ * columns_;
-    parallel(map_.threads, (int)(planes.size() / cells), map_.cancelled,
-             [&](int k, int) { mean(&planes[k * cells], reach); });
-  }
-
- private:
-  void mean(float *plane, int reach) const {
-    const int side = 2 * reach + 1;
-    const float per = 1.0f / (float)(CELL * CELL * side * side);
-    std::vector<float> columns((size_t)rows_ * columns_), row(columns_ + 2 * reach);
-    for (int y = 0; y < rows_; y++)
-      for (int v = std::max(y - reach, 0); v <= std::min(y + reach, rows_ - 1); v++)
-        for (int x = 0; x < columns_; x++) columns[(size_t)y * columns_ + x] += plane[(size_t)v * columns_ + x];
-    for (int y = 0; y < rows_; y++) {
-      memcpy(&row[reach], &columns[(size_t)y * columns_], columns_ * sizeof(float));
-      float *const to = plane + (size_t)y * columns_;
-      std::fill_n(to, columns_, 0.0f);
-      for (int u = 0; u < side; u++)
-        for (int x = 0; x < columns_; x++) to[x] += row[x + u];
-      for (int x = 0; x < columns_; x++) to[x] *= per;
-    }
-  }
-
-  const torchdof_map &map_;
-  const int rows_, columns_;
-};
-
 class Missed {
  public:
   explicit Missed(const torchdof_map &map)
       : map_(map), height_(map.height), width_(map.width), channels_(map.channels), area_((size_t)height_ * width_),
         across_((width_ + TILE - 1) / TILE), down_((height_ + TILE - 1) / TILE), pitch_(across_ * TILE),
         rows_((height_ + CELL - 1) / CELL), columns_((width_ + CELL - 1) / CELL), cells_((size_t)rows_ * columns_),
-        around_(map, rows_, columns_), plane_((size_t)pitch_ * height_), ring_(plane_), near_(plane_), coc_(plane_),
-        roots_(channels_ * plane_) {}
+        plane_((size_t)pitch_ * height_), ring_(plane_), near_(plane_), coc_(plane_), roots_(channels_ * plane_) {}
 
   // Returns whether the map has changed; out is written only then.
   bool run() {
@@ -116,22 +82,30 @@ class Missed {
     if (tiles_.empty()) return false;
     const std::vector<float> means = described(background(described(background({}))));
     std::vector<float> counts = count(means);
-    around_(counts, PLACE);
+    average(counts, PLACE);
     return take(means, counts);
   }
 
  private:
-  // Planes of described() for the pixels of a row of cells of a tile.
+  // Planes of described() for the pixels of a row of cells of a tile, which share them cell by cell.
   struct Background {
     explicit Background(int channels) : values((size_t)(channels + 4) * TILE), channels(channels) {}
     const float *seen() const { return &values[0]; }
     const float *light(int c) const { return &values[(size_t)(1 + c) * TILE]; }
-    const float *per_variance() const { return &values[(size_t)(1 + channels) * TILE]; }
-    const float *coc() const { return &values[(size_t)(2 + channels) * TILE]; }
-    const float *spread() const { return &values[(size_t)(3 + channels) * TILE]; }
+    const float *per_variance() const { return light(channels); }
+    const float *coc() const { return light(channels + 1); }
+    const float *spread() const { return light(channels + 2); }
     std::vector<float> values;
     int channels;
   };
+
+  void read(const std::vector<float> &means, int tile, int y, Background &background) const {
+    const int first = tile % across_ * CELLS, count = std::min(CELLS, columns_ - first);
+    for (int plane = 0; plane < channels_ + 4; plane++)
+      for (int k = 0; k < count; k++)
+        std::fill_n(&background.values[plane * TILE + k * CELL], CELL,
+                    means[plane * cells_ + (size_t)y * columns_ + first + k]);
+  }
 
   template <typename Body>
   void each_tile(const Body &body) {
@@ -235,10 +209,32 @@ class Missed {
     }
   }
 
+  // Turns sums of cells, plane by plane, into means over windows of 2 * reach + 1 cells, of which those beyond the
+  // frame are 0.
+  void average(std::vector<float> &planes, int reach) const {
+    parallel(map_.threads, (int)(planes.size() / cells_), map_.cancelled, [&](int k, int) {
+      float *const plane = &planes[k * cells_];
+      const int side = 2 * reach + 1;
+      const float per = 1.0f / (float)(CELL * CELL * side * side);
+      std::vector<float> sums(cells_), row(columns_ + 2 * reach);
+      for (int y = 0; y < rows_; y++)
+        for (int v = std::max(y - reach, 0); v <= std::min(y + reach, rows_ - 1); v++)
+          for (int x = 0; x < columns_; x++) sums[(size_t)y * columns_ + x] += plane[(size_t)v * columns_ + x];
+      for (int y = 0; y < rows_; y++) {
+        memcpy(&row[reach], &sums[(size_t)y * columns_], columns_ * sizeof(float));
+        float *const to = plane + (size_t)y * columns_;
+        std::fill_n(to, columns_, 0.0f);
+        for (int u = 0; u < side; u++)
+          for (int x = 0; x < columns_; x++) to[x] += row[x + u];
+        for (int x = 0; x < columns_; x++) to[x] *= per;
+      }
+    });
+  }
+
   // Means around cells, of sums of background(): weight; light, its square; coc, its square. The squares become one
   // over the variance of light, and the standard deviation of coc.
   std::vector<float> described(std::vector<float> planes) const {
-    around_(planes, NEARBY);
+    average(planes, NEARBY);
     parallel(map_.threads, rows_, map_.cancelled, [&](int y, int) {
       float *const seen = &planes[(size_t)y * columns_], *const light = seen + cells_;
       float *const square = light + channels_ * cells_, *const coc = square + cells_, *const coc_square = coc + cells_;
@@ -256,17 +252,6 @@ class Missed {
       }
     });
     return planes;
-  }
-
-  // The background around the pixels of a row of cells of a tile, which share it cell by cell.
-  Background background_of(const std::vector<float> &means, int tile, int y) const {
-    Background of(channels_);
-    for (int plane = 0; plane < channels_ + 4; plane++) {
-      const float *const cells = &means[plane * cells_ + (size_t)y * columns_ + tile % across_ * CELLS];
-      for (int k = 0; k < std::min(CELLS, columns_ - tile % across_ * CELLS); k++)
-        std::fill_n(&of.values[plane * TILE + k * CELL], CELL, cells[k]);
-    }
-    return of;
   }
 
   // Squared deviation of pixels from the background, over its variance.
@@ -311,7 +296,7 @@ class Missed {
           [&](int y) {
             std::fill(added.begin(), added.end(), 0.0f);
             if (is_second)
-              of = background_of(means, tile, y);
+              read(means, tile, y, of);
             else
               read(tile, y, SAMPLED);
           },
@@ -350,7 +335,7 @@ class Missed {
           tile, SAMPLED,
           [&](int y) {
             std::fill_n(added, COUNTS * TILE, 0.0f);
-            of = background_of(means, tile, y);
+            read(means, tile, y, of);
           },
           [&](int j, size_t at) {
             const vec ring = load<vec>(&ring_[at]);
@@ -384,7 +369,7 @@ class Missed {
       Background of(channels_);
       const auto prepare = [&](int y) {
         read(tile, y, 1);
-        of = background_of(means, tile, y);
+        read(means, tile, y, of);
       };
       const auto mark = [&](int j, size_t at) {
         const ivec may = known(at, of, j) & (deviation(at, of, j) > TAKEN);
@@ -450,7 +435,6 @@ class Missed {
   const int across_, down_, pitch_;  // tiles along both axes, pixels of whole tiles
   const int rows_, columns_;         // of cells
   const size_t cells_;
-  const Around around_;
   const size_t plane_;         // pixels of an image whose rows are pitch_ long
   Buffer<float> ring_, near_;  // of each pixel; 0 without. The coc of its near surface.
   Buffer<float> coc_, roots_;  // of pixels of rings; square roots of light, channel by channel

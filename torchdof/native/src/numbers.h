@@ -22,4 +22,6 @@ inline float clamp01(float v) {  // NaN stays NaN
   return v < 0.0f ? 0.0f : v > 1.0f ? 1.0f : v;
 }
 
+constexpr float TINY = 1.17549435e-38f;  // the smallest normal number; lower limit where light is the divisor
+
 }  // namespace torchdof

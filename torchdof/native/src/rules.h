@@ -7,12 +7,14 @@
 #include "constants/disocclusion.h"
 #include "constants/frame.h"
 #include "constants/layer_weights.h"
+#include "constants/matting.h"
 #include "numbers.h"
 
 namespace torchdof {
 
 // Constants of Python modules, which give their meanings, units and effects; here with the type of the computations.
 constexpr float KNOWN = constants::composite::KNOWN;
+constexpr float SAME_BLUR = constants::matting::SAME_BLUR;
 constexpr float BEHIND_PX = constants::disocclusion::BEHIND_PX;
 constexpr float OWN_SLOPE = constants::disocclusion::OWN_SLOPE;
 constexpr float FOOT = constants::layer_weights::FOOT;
@@ -30,6 +32,32 @@ constexpr float SEEN_FROM = constants::frame::SEEN_FROM;
 template <typename V>
 inline auto within(V v) {
   return (v >= V{}) & (v <= V{} + 1.0f);
+}
+
+// Difference in coc of two surfaces, less the part that is not seen in a strong blur: far - near - SAME_BLUR
+// min(|near|, |far|). render/surfaces/matting.py, _apart_px.
+template <typename V>
+inline V apart_px(V near, V far) {
+  return far - near - SAME_BLUR * min(max(near, -near), max(far, -far));
+}
+
+// A pixel between two surfaces, at n from 0 at the far one to 1 at the near one, counts to the near one by clamp(4 n -
+// 2.8, 0, 1), and to the far one by clamp(1.2 - 4 n, 0, 1). render/surfaces/matting.py, _on_near and _on_far.
+template <typename V>
+inline V unlimited_on_near(V n) {
+  return 4.0f * n - 2.8f;
+}
+template <typename V>
+inline V on_near(V n) {
+  return clamp01(unlimited_on_near(n));
+}
+template <typename V>
+inline V unlimited_on_far(V n) {
+  return 1.2f - 4.0f * n;
+}
+template <typename V>
+inline V on_far(V n) {
+  return clamp01(unlimited_on_far(n));
 }
 
 // Largest coc of a pixel's own surface nearby, which may slope: c + max(OWN_SLOPE |c| - BEHIND_PX, 0); and its

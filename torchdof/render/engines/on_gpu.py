@@ -55,24 +55,19 @@ def composited(frame: PaddedFrame, kernels: Kernels, plain: Plain) -> Tensor | N
 
 
 def matte(
-    light: Tensor,
-    coc_px: Tensor,
-    valid: Tensor | None = None,
-    ops: Ops = EAGER,
-    covered: Tensor | None = None,
+    light: Tensor, coc_px: Tensor, valid: Tensor | None = None, ops: Ops = EAGER, covered: Tensor | None = None
 ) -> Matted:
     """:func:`torchdof.render.surfaces.matting.matte`, by kernels of a GPU if they compute it.
 
     Raises:
         ValueError: If they cannot be used and ``TORCHDOF_ENGINE`` is ``gpu``.
     """
-    maps = [t for t in (light, coc_px, valid, covered) if t is not None]
-    # the number of items last, as in `composited`
-    if not takes(maps, light.shape[1], 2) or len(light) > matting.MOST_ITEMS:
+    maps, channels = [t for t in (light, coc_px, valid, covered) if t is not None], light.shape[1]
+    # the number of items after `takes`, as in `composited`
+    is_taken = takes(maps, channels, 2) and len(light) <= matting.MOST_ITEMS
+    if not is_taken or _missing(_matte_of_trial, channels, light.device.index or 0):
         return plain_matte(light, coc_px, valid, ops, covered)
-    if _missing(_matte_of_trial, light.shape[1], light.device.index or 0):
-        return plain_matte(light, coc_px, valid, ops, covered)
-    return Matted(*_matte_by_kernels(light, coc_px, valid, covered).split([light.shape[1], light.shape[1], 1, 1], 1))
+    return Matted(*_matte_by_kernels(light, coc_px, valid, covered).split([channels, channels, 1, 1], 1))
 
 
 def takes(maps: Sequence[Tensor], channels: int, surfaces: int) -> bool:

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from ...tensors import is_traced
 from ..layers.downsampling import downsampled, upsampled
+from .windows import highest
 
 __all__ = ["covered_by"]
 
@@ -136,7 +137,7 @@ def _largest_around(values: Tensor) -> Tensor:
     height, width = values.shape[-2:]
     side = 2 ** (_LEVELS - 1)
     cells = functional.max_pool2d(functional.pad(values, (0, -width % side, 0, -height % side)), side)
-    return upsampled(functional.max_pool2d(cells, 3, 1, 1), side)[..., :height, :width]
+    return upsampled(highest(cells, 1), side)[..., :height, :width]
 
 
 def _spread(values: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:

@@ -27,6 +27,7 @@ from ..engines.ops import EAGER, Ops
 from ..engines.traced import is_compiled, one_operator
 from ..rules import active
 from .missed import completed
+from .windows import highest
 
 __all__ = ["STEP_PX", "judged", "mended", "repair", "repair_edges"]
 
@@ -157,7 +158,7 @@ def repair_edges(image: Tensor, depth: Tensor, edges: DepthEdges = "repair") -> 
         return depth
     depth = depth.expand(image.shape[0], -1, -1, -1)
     nearness = torch.where(depth > 0, 1.0 / depth.detach(), torch.nan)
-    high = _highest(torch.where(depth > 0, nearness, 0.0).float(), _REACH)
+    high = highest(torch.where(depth > 0, nearness, 0.0).float(), _REACH)
     repaired = repair(image, nearness, _STEP * high, edges == "auto")
     changed = (repaired != nearness) & (depth > 0)
     return torch.where(changed, 1.0 / repaired.clamp_min(0.0), depth)
@@ -426,22 +427,22 @@ def _find(nearness: Tensor, valid: Tensor, step: Tensor) -> _Edges:
     """Finds ramps and steps, and the nearness of the two surfaces that meet there."""
     ends = _ends(nearness, valid)
     slope, jump, steepness = _slopes(nearness, valid)
-    span = _highest(ends, _REACH).sum(1, keepdim=True)
+    span = highest(ends, _REACH).sum(1, keepdim=True)
     # a ramp is short and has flat places around it; a slope has none
-    flattest = -_highest(-_mean(slope, 2), _FLAT_REACH)
+    flattest = -highest(-_mean(slope, 2), _FLAT_REACH)
     is_ramp = (slope > 0.1 * step) & (slope > _SHALLOW * span) & (span > step) & (flattest < _FLAT * slope) & valid
 
     # the surfaces at both ends of a ramp: extremes spread along it pixel by pixel
     spread = ends
     for _ in range(_RAMP_REACH):
-        spread = torch.where(is_ramp, _highest(spread, 1), spread)
+        spread = torch.where(is_ramp, highest(spread, 1), spread)
     is_ramp = is_ramp & (spread.sum(1, keepdim=True) > step)
     ends = torch.where(is_ramp, spread, ends)
 
     # the surfaces on both sides of a step: extremes within k pixels; the smallest k that reaches the step counts
     rings = [torch.cat([ends, jump], 1)]
     for _ in range(_RINGS):
-        rings.append(_highest(rings[-1], 1))
+        rings.append(highest(rings[-1], 1))
     least = torch.maximum(_NEAREST * rings[-1][:, :2].sum(1, keepdim=True), step)
     ring, sides = torch.full_like(nearness, _RINGS + 1, dtype=torch.long), rings[-1][:, :2]
     for k in range(_RINGS, 0, -1):
@@ -622,7 +623,7 @@ def _without_ringing(nearness: Tensor, valid: Tensor, step: Tensor) -> Tensor:
 
 
 def _spread(values: Tensor) -> Tensor:
-    return _highest(values, _RINGING_REACH)
+    return highest(values, _RINGING_REACH)
 
 
 def _lift_lamps(
@@ -641,8 +642,8 @@ def _lift_lamps(
     """
     brightest = light.amax(1, keepdim=True)
     usual = _mean(brightest.sqrt(), _USUAL_REACH) ** 2
-    span = _highest(torch.cat([nearness, -nearness], 1), _REACH).sum(1, keepdim=True)
-    around = _highest(brightest, _LAMP_REACH)
+    span = highest(torch.cat([nearness, -nearness], 1), _REACH).sum(1, keepdim=True)
+    around = highest(brightest, _LAMP_REACH)
     is_lamp = (brightest > 4.0 * usual) & (brightest > 0.1 * around) & (span > 0.5 * step) & is_soft
     cover = torch.where(brightest > 2.0 * usual, brightest / around.clamp_min(1e-30), 0.0)
     lamp_pixels = pixels.indices(is_lamp)
@@ -722,14 +723,6 @@ def _slopes(nearness: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         jump.append(torch.maximum(before, after) - least[-1])
     steepness = torch.stack([torch.hypot(a, b) for a in sides[0] for b in sides[1]]).mean(0)
     return torch.maximum(*least), torch.maximum(*jump), steepness
-
-
-def _highest(values: Tensor, reach: int) -> Tensor:
-    side = 2 * reach + 1
-    if reach == 1:
-        return functional.max_pool2d(values, side, stride=1, padding=reach)
-    rows = functional.max_pool2d(values, (1, side), stride=1, padding=(0, reach))
-    return functional.max_pool2d(rows, (side, 1), stride=1, padding=(reach, 0))
 
 
 def _mean(values: Tensor, reach: int) -> Tensor:

@@ -9,7 +9,6 @@ import math
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as functional
 from torch import Tensor
 
 from ... import native
@@ -17,6 +16,7 @@ from ...pixels import Selected
 from ..engines.compiled_steps import compiled_step
 from ..engines.ops import EAGER, Ops
 from ..rules import active
+from .windows import highest
 
 __all__ = ["FALLOFF", "NEVER_PX", "Matted", "falloff", "matte"]
 
@@ -162,7 +162,7 @@ def _edge_pixels(light: Tensor, coc_px: Tensor, valid: Tensor | None, ops: Ops) 
     """Step 1 of :func:`matte`: the pixels beside another surface, and the coc of the two surfaces around each."""
     known = None if valid is None else valid > 0
     high, low = (c if known is None else torch.where(known, c, -NEVER_PX) for c in (coc_px.detach(), -coc_px.detach()))
-    high, low = (functional.max_pool2d(c, 3, stride=1, padding=1) for c in (high, low))
+    high, low = (highest(c, 1) for c in (high, low))
     is_edge = _apart_px(-low, high) > _EDGE_PX
     chosen = ops.select(is_edge if known is None else is_edge & known)
 
@@ -186,13 +186,23 @@ def _apart_px(near_px: Tensor, far_px: Tensor) -> Tensor:
     return far_px - near_px - _SAME_BLUR * torch.minimum(near_px.abs(), far_px.abs())
 
 
+def _on_near(place: Tensor) -> Tensor:
+    """How far a pixel counts to the near one of two surfaces, at its place from 0, the far one, to 1, the near one."""
+    return (4 * place - 2.8).clamp(0, 1)
+
+
+def _on_far(place: Tensor) -> Tensor:
+    """The same for the far surface."""
+    return (1.2 - 4 * place).clamp(0, 1)
+
+
 def _colours(edge: _EdgePixels, light: Tensor, coc_px: Tensor) -> tuple[_Colour, _Colour]:
     """Step 2 of :func:`matte`: the colours of the near and the far surface, mostly of unmixed pixels."""
     certainty = edge.chosen.put(torch.zeros_like(coc_px), edge.certainty)
     weight = (1.0 - edge.chosen.around(certainty)[0] + _UNCLEAN) * falloff(light, 1)
     weight = weight if edge.counts is None else weight * edge.counts
     nearness = edge.nearness
-    weights = weight * (4 * nearness - 2.8).clamp(0, 1), weight * (1.2 - 4 * nearness).clamp(0, 1)
+    weights = weight * _on_near(nearness), weight * _on_far(nearness)
     around = edge.around
     if active().mixed_neighbours:
         around = around - _mixed_light(around, _clean_light(edge, weight, light), *weights)

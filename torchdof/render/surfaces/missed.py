@@ -8,6 +8,8 @@ A map with exact edges stays unchanged, as things of the background do not prefe
 pixels are counted from the top left, so that a few pixels of a mirrored frame may be decided otherwise.
 """
 
+import itertools
+
 import torch
 import torch.nn.functional as functional
 from torch import Tensor
@@ -17,6 +19,7 @@ from ...tensors import is_in_memory, is_traced
 from ..engines.ops import EAGER, Ops
 from ..engines.traced import is_compiled, one_operator
 from ..rules import active
+from .windows import highest
 
 __all__ = ["completed"]
 
@@ -59,7 +62,7 @@ def completed(image: Tensor, coc_px: Tensor, before: Tensor, ops: Ops = EAGER) -
     5. There, pixels with ``z^2 >`` :data:`_TAKEN` that touch the near surface, or one another, get its coc.
 
     Args:
-        image: ``[B, C, H, W]``, linear light; its scale does not matter.
+        image: ``[B, C, H, W]``, linear light; its scale does not matter if it is above 1e-8.
         coc_px: ``[B or 1, 1, H, W]``, signed, with repaired edges. Invalid values stay and affect no other pixel.
         before: The map before the repair, like ``coc_px``.
         ops: Skips frames without such edges.
@@ -91,12 +94,13 @@ def _completed(image: Tensor, coc_px: Tensor, is_inexact: Tensor, ops: Ops) -> T
     is_valid = (coc_px.abs() <= _LARGEST_PX) & is_inexact[:, None, None, None]
     coc, blur = torch.where(is_valid, coc_px, 0.0), torch.where(is_valid, coc_px.abs(), _FAR_PX)
     # blur of the near surface, of which each ring takes the largest around it; negative behind the focus
-    surface = torch.where(is_valid, -coc_px, -_FAR_PX)
+    surface = values = torch.where(is_valid, -coc_px, -_FAR_PX)
     near, ring = torch.full_like(coc, -_FAR_PX), torch.zeros_like(coc)
-    for k in range(len(_RINGS_PX)):
-        around = _largest(surface, _RINGS_PX[0]) if k == 0 else _largest(near, _RINGS_PX[k] - _RINGS_PX[k - 1])
+    for k, (start_px, end_px) in enumerate(itertools.pairwise((0, *_RINGS_PX)), 1):
+        around = highest(values, end_px - start_px)
         is_new = (ring == 0) & _is_beyond(blur, around)
-        near, ring = torch.where(is_new, around, near), torch.where(is_new, k + 1.0, ring)
+        near, ring = torch.where(is_new, around, near), torch.where(is_new, float(k), ring)
+        values = near
     has_edges = ring.any()
 
     light = torch.where(torch.isfinite(image), image, 0.0).clamp(0.0, _BRIGHTEST).sqrt()
@@ -122,11 +126,10 @@ def _completed(image: Tensor, coc_px: Tensor, is_inexact: Tensor, ops: Ops) -> T
         return coc_px
 
     for _ in range(_REACH):
-        around = _largest(surface, 1)
+        around = highest(surface, 1)
         is_taken = may & _is_beyond(blur, around)
         surface, may = torch.where(is_taken, around, surface), may & ~is_taken
-    completed = torch.where(is_valid, -surface, coc_px)
-    return ops.equal_unless(lambda: has_edges, completed, coc_px)
+    return ops.equal_unless(lambda: has_edges, torch.where(is_valid, -surface, coc_px), coc_px)
 
 
 def _is_beyond(blur: Tensor, near: Tensor) -> Tensor:
@@ -166,7 +169,3 @@ def _of_cells(cells: Tensor, like: Tensor) -> Tensor:
     """The value of each pixel's cell."""
     pixels = functional.interpolate(cells, scale_factor=float(_CELL), mode="nearest")
     return pixels[..., : like.shape[-2], : like.shape[-1]]
-
-
-def _largest(values: Tensor, reach: int) -> Tensor:
-    return functional.max_pool2d(values, 2 * reach + 1, stride=1, padding=reach)
