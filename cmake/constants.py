@@ -21,7 +21,7 @@ MODULES = (
     "native/__init__",
     *(f"optics/{name}" for name in ("kernel_bank", "placed_kernels", "psf")),
     *(f"render/{name}" for name in ("exposure", "highlights", "pipeline")),
-    *(f"render/surfaces/{name}" for name in ("border", "disocclusion", "edges", "emitters", "frame")),
+    *(f"render/surfaces/{name}" for name in ("border", "disocclusion", "doubt", "edges", "emitters", "frame")),
     *(f"render/surfaces/{name}" for name in ("matting", "missed")),
     *(f"render/layers/{name}" for name in ("composite", "convolution", "downsampling", "field")),
     *(f"render/layers/{name}" for name in ("layer_cocs", "layer_weights", "plan")),

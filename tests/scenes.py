@@ -420,16 +420,32 @@ def pixels_from_post(width: int) -> Tensor:
     return (torch.arange(width) - 70).abs() - 20
 
 
-def furry_post(background: float = 0.8, height: int = 224, width: int = 160) -> tuple[Tensor, Tensor, Tensor]:
-    """An image of a dark furry post before a smooth background, a map of the coc without its hairs, and the exact map.
+def wavy_post(height: int = 224, width: int = 160) -> tuple[Tensor, Tensor, Tensor]:
+    """An image of a dark post before a background in focus, a soft map whose edges wind about it, and the exact map."""
+    generator = torch.Generator().manual_seed(0)
+    beside, rows = pixels_from_post(width), torch.arange(height)[:, None]
+    light = torch.where(beside < 0, 0.1, 0.8) * (1 + 0.05 * torch.randn(3, height, width, generator=generator))
+    bends = beside + 0.5 + 3.5 * torch.sin(2 * math.pi * rows / 20)
+    soft = torch.where(bends < 0, -12.0, 0.5)[None, None]
+    for _ in range(2):
+        soft = functional.avg_pool2d(functional.pad(soft, (2,) * 4, mode="replicate"), 5, 1)
+    exact = torch.where(beside < 0, -12.0, 0.5).expand(1, 1, height, -1)
+    return light.clamp_min(0)[None].contiguous(), soft.contiguous(), exact
 
-    Four rows of five have hairs, two to eight px long, on both sides.
+
+def furry_post(
+    background: float = 0.8, height: int = 224, width: int = 160, noise: float = 0.02
+) -> tuple[Tensor, Tensor, Tensor]:
+    """An image of a dark furry post before a background, a map of the coc without its hairs, and the exact map.
+
+    Four rows of five have hairs, two to eight px long, on both sides. The background is smooth for the repair with a
+    ``noise``, relative to the light, of 0.02, but not with 0.1.
     """
     generator = torch.Generator().manual_seed(0)
     lengths = torch.randint(2, 9, (height // 2 + 1,), generator=generator).repeat_interleave(2)[:height, None]
     beside = pixels_from_post(width) - lengths * (torch.arange(height) % 5 < 4)[:, None]
     is_near = beside < 0
-    light = torch.where(is_near, 0.05, background) * (1 + 0.02 * torch.randn(height, width, generator=generator))
+    light = torch.where(is_near, 0.05, background) * (1 + noise * torch.randn(height, width, generator=generator))
     given = torch.where(pixels_from_post(width) < 0, -12.0, 0.5).expand(height, -1)
     exact = torch.where(is_near, -12.0, 0.5)
     return light.clamp_min(0).expand(1, 3, -1, -1).contiguous(), given[None, None].contiguous(), exact[None, None]

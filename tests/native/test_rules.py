@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from torchdof.render.layers import composite, layer_weights
-from torchdof.render.surfaces import disocclusion, frame, matting
+from torchdof.render.surfaces import disocclusion, doubt, frame, matting
 
 ROOT = Path(__file__).parents[2]
 COMPILER = os.environ.get("CXX") or shutil.which("c++")
@@ -24,6 +24,7 @@ RULES: dict[str, Callable[[Tensor], Tensor]] = {
     "apart_px(v, broadcast(0.7f))[0]": lambda x: matting._apart_px(x, torch.full_like(x, 0.7)),
     "on_near(v)[0]": matting._on_near,
     "on_far(v)[0]": matting._on_far,
+    "float(is_beyond(0.4f, x))": lambda x: doubt.is_beyond(torch.full_like(x, 0.4), x).to(x.dtype),
     "end_of_surface(x)": disocclusion.end_of_surface,
     "is_another_surface(x)": disocclusion.is_another_surface,
     "is_another_surface(v)[0]": disocclusion.is_another_surface,

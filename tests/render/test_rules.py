@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.scenes import furry_post
+from tests.scenes import furry_post, wavy_post
 from torchdof import blur_by_coc, native
 from torchdof.options import DepthEdges
 from torchdof.reference.degraded import degrade
@@ -31,6 +31,8 @@ def scene_for(rule: str) -> tuple[Tensor, Tensor]:
         return torch.where(coc > 0, 1.0, 0.01).expand(-1, 3, -1, -1).contiguous(), coc
     if rule == "missed_parts":
         return furry_post()[:2]
+    if rule == "in_doubt":
+        return wavy_post()[:2]
     if rule in ("own_slope", "fewer_rays"):
         light = torch.rand(1, 3, 64, 96, generator=torch.Generator().manual_seed(0))
         y, x = torch.meshgrid(torch.linspace(0, 1, 64), torch.linspace(0, 1, 96), indexing="ij")

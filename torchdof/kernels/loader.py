@@ -19,7 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-_CONSTANTS = ("composite", "disocclusion", "frame", "layer_weights", "matting")
+_CONSTANTS = ("composite", "disocclusion", "doubt", "frame", "layer_weights", "matting")
 HEADERS = (
     *("frame.h", "weights.h", "matting.h", "split.h", "rules.h", "numbers.h"),
     *(f"constants/{name}.h" for name in _CONSTANTS),

@@ -52,7 +52,8 @@ class Rules:
     third_surfaces: bool = _rule("keeps a ramp's pixel that shows neither surface between them")
     ringing: bool = _rule("removes rims of interpolation from soft maps")
     soft_lamps: bool = _rule("restores lamps that a soft map has averaged away")
-    missed_parts: bool = _rule("gives fine parts that the map misses to a blurred foreground")
+    in_doubt: bool = _rule("blurs the edges of soft maps that the image contradicts")
+    missed_parts: bool = _rule("lets blurred foregrounds grow by what the map misses of them")
     rounding: bool = _rule("takes the rounding of a file for noise")
 
 

@@ -11,9 +11,11 @@
 #include <vector>
 
 #include "api.h"
+#include "constants/doubt.h"
 #include "constants/edges.h"
 #include "entry.h"
 #include "memory.h"
+#include "rules.h"
 #include "simd.h"
 #include "threads.h"
 
@@ -81,6 +83,18 @@ constexpr float NONE = constants::edges::NEVER;
 constexpr float LARGEST = constants::edges::LARGEST;
 constexpr float BRIGHTEST = constants::edges::BRIGHTEST;
 constexpr int KINDS = DIRECTIONS * PLACES;
+
+// Those of render/surfaces/doubt.py.
+constexpr float CONTRADICTED = constants::doubt::CONTRADICTED;
+constexpr float OFTEN_CONTRADICTED = constants::doubt::OFTEN_CONTRADICTED;
+constexpr float ASSUMED = constants::doubt::ASSUMED;
+constexpr float MOVED_PX = constants::doubt::MOVED_PX;
+constexpr int REACH_IN_DOUBT = constants::doubt::REACH;
+constexpr float OF_NEAR = constants::doubt::OF_NEAR;
+constexpr float BLUR_IN_DOUBT_PX = constants::doubt::LEAST_BLUR_PX;
+constexpr int AT_EDGE_PX = constants::doubt::AT_EDGE_PX;
+constexpr int EDGE_REACH = constants::doubt::EDGE_REACH;
+constexpr float LEAST_STEP_PX = constants::doubt::LEAST_STEP_PX;
 
 constexpr int AREA = 96;  // side of a tile in pixels
 // A pixel's result depends on the pixels within this many of it: without ramps, and with ramps.
@@ -248,6 +262,11 @@ struct EdgeSums {
   int64_t middles = 0;  // pixels in the middle half of steps
 };
 
+// Weights of the clearest edge pixels of far surfaces and of near ones, and of those that have the right colour.
+struct Agreement {
+  double clear[2] = {}, agreed[2] = {};
+};
+
 class Repair {
  public:
   explicit Repair(const torchdof_map &map)
@@ -260,6 +279,7 @@ class Repair {
   // 3. In automatic mode stop here if the map is exact or its edges are unrelated to the image's.
   // 4. Find and decide the edges of the whole frame; move pixels that have the depth of the wrong surface.
   // 5. In a soft map also remove ringing, and restore the nearness of small lamps that a blur has reduced.
+  // 6. Blur the edges of a soft map of the coc that the image contradicts.
   bool run() {
     noise_step_ = NOISES * noise();
     const int every = (int)std::ceil(std::sqrt((double)area_ / SAMPLED));
@@ -281,7 +301,8 @@ class Repair {
     judge(sampled, false);
     decide(sampled);
     calibrate(sampled);
-    if (map_.automatic && (!is_related(sampled) || !(is_soft || is_inexact(sampled)))) return false;
+    const Agreement agreement = agreement_of(sampled);
+    if (map_.automatic && (!is_related(agreement) || !(is_soft || is_inexact(sampled)))) return false;
     parallel(height_, [&](int y) {
       memcpy(map_.out + (size_t)y * width_, map_.nearness + (size_t)y * width_, width_ * sizeof(float));
     });
@@ -295,6 +316,8 @@ class Repair {
     const float lost_px = move(groups, is_soft);
     if (is_soft) remove_ringing();
     if (is_soft) lift_lamps(blur(), lost_px);
+    if (const float doubt = doubt_of(agreement); is_soft && map_.automatic && map_.is_coc && doubt > 0)
+      blur_in_doubt(doubt);
     return true;
   }
 
@@ -1044,10 +1067,9 @@ class Repair {
     clamp_to_frame(grid, grid);
   }
 
-  // Whether colours agree with the map at pixels where the map is most likely right: on one side of its edges at least,
-  // because beside a foreground that is too thin they show the foreground.
-  bool is_related(const std::vector<Group> &groups) const {
-    double total[2] = {}, agreed[2] = {};
+  // How far colours agree with the map at pixels where the map is most likely right.
+  Agreement agreement_of(const std::vector<Group> &groups) const {
+    Agreement found;
     for (const Group &group : groups)
       for (size_t k = 0; k < group.edges.size(); k++) {
         const Edge &edge = group.edges[k];
@@ -1058,13 +1080,27 @@ class Repair {
           continue;
         const float weight = std::min(0.5f * std::fabs(score), 1.0f);
         const bool is_near = level > 0.5f;
-        total[is_near] += weight;
-        if ((score > 0) == is_near) agreed[is_near] += weight;
+        found.clear[is_near] += weight;
+        if ((score > 0) == is_near) found.agreed[is_near] += weight;
       }
+    return found;
+  }
+
+  // Whether they do on one side of its edges at least, because beside a foreground that is too thin they show the
+  // foreground.
+  static bool is_related(const Agreement &found) {
     const auto agrees = [&](bool side) {
-      return (agreed[side] + 0.25f * PRIOR_COUNT) / (total[side] + 0.5f * PRIOR_COUNT) > RELATED;
+      return (found.agreed[side] + 0.25f * PRIOR_COUNT) / (found.clear[side] + 0.5f * PRIOR_COUNT) > RELATED;
     };
     return agrees(false) || agrees(true);
+  }
+
+  // render/surfaces/doubt.py, doubt_of.
+  static float doubt_of(const Agreement &found) {
+    const auto share = [&](bool side) {
+      return (float)((found.clear[side] - found.agreed[side]) / (found.clear[side] + ASSUMED));
+    };
+    return clamp01((std::min(share(false), share(true)) - CONTRADICTED) / (OFTEN_CONTRADICTED - CONTRADICTED));
   }
 
   // Share of pixels that show the near surface, by kind: a maximum-likelihood fit (EM) to the scores, with PRIOR_COUNT
@@ -1328,6 +1364,62 @@ class Repair {
       });
     });
   }
+
+  // render/surfaces/doubt.py, blurred_in_doubt.
+  void blur_in_doubt(float doubt) {
+    memcpy(evidence_.data(), map_.out, area_ * sizeof(float));
+    const std::vector<Group> parts = tiles();
+    parallel((int)parts.size(), [&](int g) {
+      const Part &part = parts[g].part, beside = part.grown(REACH_IN_DOUBT), whole = beside.grown(REACH_IN_DOUBT);
+      const Grid now(whole), moved(whole), rows(whole);
+      const auto value = [this](float v) { return std::fabs(v) <= LARGEST ? sign_ * v : -NONE; };
+      fetch(map_.nearness, moved, value);
+      fetch(evidence_.data(), now, value);
+      vec any{};
+      each_vector(whole, [&](int y, int x) {
+        const vec change = abs(load<vec>(now.at(y, x)) - load<vec>(moved.at(y, x)));
+        store(moved.at(y, x), change > MOVED_PX ? broadcast(1.0f) : vec{});
+        any = max(any, load<vec>(moved.at(y, x)));
+      });
+      if (!(reduce_max(any) > 0)) return;
+
+      const Grid near(beside), is_near(beside), share(part), is_beside(part);
+      max_filter<REACH_IN_DOUBT>(now, near, rows, beside);
+      each_vector(beside, [&](int y, int x) {
+        const vec half = 0.5f * max(load<vec>(near.at(y, x)), broadcast(1.0f));
+        store(is_near.at(y, x), load<vec>(now.at(y, x)) > half ? broadcast(1.0f) : vec{});
+      });
+      clamp_to_frame(is_near, beside);
+      sums<REACH_IN_DOUBT>(is_near, share, rows, part, one_over_square(REACH_IN_DOUBT));
+      max_filter<REACH_IN_DOUBT>(moved, is_beside, rows, part);
+
+      const Part at_edge = part.grown(AT_EDGE_PX), around = part.grown(EDGE_REACH);
+      const Grid down(around), high(part), low(part), edge(at_edge), fading(part);
+      each_vector(around, [&](int y, int x) {
+        const vec own = load<vec>(now.at(y, x));
+        store(down.at(y, x), own > -NONE ? -own : own);
+      });
+      max_filter<EDGE_REACH>(now, high, rows, part);
+      max_filter<EDGE_REACH>(down, low, rows, part);
+      each_vector(at_edge, [&](int y, int x) { store(edge.at(y, x), max_3x3(moved.at(y, x), moved.pitch)); });
+      clamp_to_frame(edge, at_edge);
+      sums<AT_EDGE_PX>(edge, fading, rows, part, one_over_square(AT_EDGE_PX));
+
+      for (int y = part.y0; y < part.bottom(); y++)
+        for (int x = part.x0; x < part.right(); x++) {
+          const float own = *now.at(y, x), nearest = *near.at(y, x);
+          float least = 0;
+          if (*is_beside.at(y, x) > 0 && is_beyond(std::fabs(own), nearest))
+            least = OF_NEAR * nearest * std::min(2.0f * *share.at(y, x), 1.0f);
+          if (*high.at(y, x) + *low.at(y, x) > LEAST_STEP_PX)
+            least = std::max(least, BLUR_IN_DOUBT_PX * *fading.at(y, x));
+          least *= doubt;
+          if (std::fabs(own) < least) map_.out[(size_t)y * width_ + x] = sign_ * (own > 0 ? least : -least);
+        }
+    });
+  }
+
+  static constexpr float one_over_square(int reach) { return 1.0f / (float)((2 * reach + 1) * (2 * reach + 1)); }
 
   // bright: the brightest channel of each pixel; usual: in a part, the square of the mean of its root around the pixel.
   void brightest(const Grid &bright, const Grid &usual, const Grid &rows, const Part &part) const {

@@ -1,5 +1,6 @@
 // Gives missed fine parts of blurred foregrounds to them: the compiled version of torchdof/render/surfaces/missed.py.
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <cstring>
 #include <utility>
@@ -9,6 +10,7 @@
 #include "constants/missed.h"
 #include "entry.h"
 #include "memory.h"
+#include "rules.h"
 #include "simd.h"
 #include "threads.h"
 
@@ -19,20 +21,19 @@ namespace {
 using constants::missed::RINGS_PX;
 constexpr int RIM = constants::missed::RIM;
 constexpr int SAMPLED = constants::missed::SAMPLED;
-constexpr int REACH = constants::missed::REACH;
 constexpr int CELL = constants::missed::CELL;
 constexpr int NEARBY = constants::missed::NEARBY;
-constexpr int PLACE = constants::missed::PLACE;
-constexpr float APART_PX = constants::missed::APART_PX;
-constexpr float SHARPER = constants::missed::SHARPER;
+constexpr int GROWTH_STEP_PX = constants::missed::GROWTH_STEP_PX;
+constexpr float GROWTH_PX = constants::missed::GROWTH_PX;
+constexpr float GROWTH_OVER_SMOOTH_PX = constants::missed::GROWTH_OVER_SMOOTH_PX;
 constexpr float GRAIN = constants::missed::GRAIN;
+constexpr float SMOOTH = constants::missed::SMOOTH;
 constexpr float OUTLIER = constants::missed::OUTLIER;
 constexpr float UNLIKE = constants::missed::UNLIKE;
 constexpr float MOST_UNLIKE = constants::missed::MOST_UNLIKE;
-constexpr float TAKEN = constants::missed::TAKEN;
 constexpr float MISSED = constants::missed::MISSED;
+constexpr float MANY_MISSED = constants::missed::MANY_MISSED;
 constexpr float COUNTED = constants::missed::COUNTED;
-constexpr float COMPARED = constants::missed::COMPARED;
 constexpr float ON_SURFACE = constants::missed::ON_SURFACE;
 constexpr float LEAST_SAMPLES = constants::missed::LEAST_SAMPLES;
 constexpr float FAR_PX = constants::missed::FAR_PX;
@@ -40,20 +41,13 @@ constexpr float LARGEST_PX = constants::missed::LARGEST_PX;
 constexpr float BRIGHTEST = constants::missed::BRIGHTEST;
 
 constexpr int TILE = 128;                // px; side of the squares that a thread processes at once
-constexpr int MARGIN = 16;               // px around it in which rings are found, too
+constexpr int MARGIN = 32;               // px around it in which rings are found, too
 constexpr int SIDE = TILE + 2 * MARGIN;  // px; side of a window
 constexpr int PITCH = SIDE + 2 * LANES;  // of a window; its columns begin at LANES
 constexpr int WINDOW = SIDE * PITCH;
 constexpr int CELLS = TILE / CELL;  // along a side of a tile
 constexpr int RINGS = sizeof(RINGS_PX) / sizeof(RINGS_PX[0]);
-constexpr int COUNTS = 4;  // planes: unlike pixels and all pixels, of the rim and of the background
 static_assert(TILE % CELL == 0 && TILE % LANES == 0 && MARGIN % LANES == 0 && MARGIN >= RINGS_PX[RINGS - 1], "");
-
-// Whether a pixel with this blur is less blurred than, and thus behind, a near surface of that coc.
-template <typename V>
-auto is_beyond(V blur, V near) {
-  return blur < -SHARPER * near - APART_PX;
-}
 
 bool is_valid(float coc) { return std::fabs(coc) <= LARGEST_PX; }
 
@@ -81,27 +75,26 @@ class Missed {
     find_rings();
     if (tiles_.empty()) return false;
     const std::vector<float> means = described(background(described(background({}))));
-    std::vector<float> counts = count(means);
-    average(counts, PLACE);
-    return take(means, counts);
+    return grow(means, growth(count(means)));
   }
 
  private:
   // Planes of described() for the pixels of a row of cells of a tile, which share them cell by cell.
   struct Background {
-    explicit Background(int channels) : values((size_t)(channels + 4) * TILE), channels(channels) {}
+    explicit Background(int channels) : values((size_t)(channels + 5) * TILE), channels(channels) {}
     const float *seen() const { return &values[0]; }
     const float *light(int c) const { return &values[(size_t)(1 + c) * TILE]; }
     const float *per_variance() const { return light(channels); }
     const float *coc() const { return light(channels + 1); }
     const float *spread() const { return light(channels + 2); }
+    const float *is_smooth() const { return light(channels + 3); }
     std::vector<float> values;
     int channels;
   };
 
   void read(const std::vector<float> &means, int tile, int y, Background &background) const {
     const int first = tile % across_ * CELLS, count = std::min(CELLS, columns_ - first);
-    for (int plane = 0; plane < channels_ + 4; plane++)
+    for (int plane = 0; plane < channels_ + 5; plane++)
       for (int k = 0; k < count; k++)
         std::fill_n(&background.values[plane * TILE + k * CELL], CELL,
                     means[plane * cells_ + (size_t)y * columns_ + first + k]);
@@ -172,7 +165,7 @@ class Missed {
         for (int at = i * PITCH + LANES; at < (i + 1) * PITCH - LANES; at += LANES) {
           const vec was = load<vec>(near + at);
           const vec least = least_of(lowest + at, PITCH, reach);
-          const ivec is_new = (was == FAR_PX) & is_beyond(abs(load<vec>(coc + at)), least);
+          const ivec is_new = (was == FAR_PX) & is_beyond(abs(load<vec>(coc + at)), -least);
           if (!any_of(is_new)) continue;
           is_any_new = true;
           store(near + at, is_new ? least : was);
@@ -231,13 +224,14 @@ class Missed {
     });
   }
 
-  // Means around cells, of sums of background(): weight; light, its square; coc, its square. The squares become one
-  // over the variance of light, and the standard deviation of coc.
+  // Means around cells, of sums of background(): weight; light, its square; coc, its square; 0. The squares become one
+  // over the variance of light, and the standard deviation of coc. The last plane becomes 1 where the light is smooth.
   std::vector<float> described(std::vector<float> planes) const {
     average(planes, NEARBY);
     parallel(map_.threads, rows_, map_.cancelled, [&](int y, int) {
       float *const seen = &planes[(size_t)y * columns_], *const light = seen + cells_;
       float *const square = light + channels_ * cells_, *const coc = square + cells_, *const coc_square = coc + cells_;
+      float *const is_smooth = coc_square + cells_;
       const float per_channel = 1.0f / (float)channels_;
       for (int x = 0; x < columns_; x++) {
         const float per = 1.0f / std::max(seen[x], 1e-9f);
@@ -247,6 +241,7 @@ class Missed {
           mean *= per, bright += per_channel * mean * mean;
         }
         const float variance = std::max(square[x] * per - bright, 0.0f) + GRAIN * bright + 1e-12f;
+        is_smooth[x] = variance < SMOOTH * bright;
         square[x] = per_channel / variance, coc[x] *= per;
         coc_square[x] = std::sqrt(std::max(coc_square[x] * per - coc[x] * coc[x], 0.0f));
       }
@@ -282,10 +277,10 @@ class Missed {
       }
   }
 
-  // Step 2: sums of the samples of each cell: their weight, light, its square, coc and its square. With the means of a
-  // first pass, samples far from them get less weight.
+  // Step 2: sums of the samples of each cell: their weight, light, its square, coc and its square; the last plane is 0.
+  // With the means of a first pass, samples far from them get less weight.
   std::vector<float> background(const std::vector<float> &means) {
-    const int planes = channels_ + 4;
+    const int planes = channels_ + 5;
     const bool is_second = !means.empty();
     std::vector<float> sums(planes * cells_);
     each_tile([&](int tile) {
@@ -325,46 +320,59 @@ class Missed {
     return sums;
   }
 
-  // Steps 3 and 4: sums of the counts of each cell.
-  std::vector<float> count(const std::vector<float> &means) {
-    std::vector<float> sums(COUNTS * cells_);
+  // Pixels of the rim, or of the background, and how many of them are unlike the background.
+  struct Count {
+    double unlike = 0, all = 0;
+    double share() const { return unlike / std::max(all, 1.0); }
+  };
+  using Counts = std::array<Count, 2>;
+
+  // Step 3: counts of the rim and of the background.
+  Counts count(const std::vector<float> &means) {
+    std::vector<Counts> of_tiles(across_ * down_);
     each_tile([&](int tile) {
       Background of(channels_);
-      float added[COUNTS * TILE];
-      each_vector(
-          tile, SAMPLED,
-          [&](int y) {
-            std::fill_n(added, COUNTS * TILE, 0.0f);
-            read(means, tile, y, of);
-          },
-          [&](int j, size_t at) {
-            const vec ring = load<vec>(&ring_[at]);
-            const vec capped = min(deviation(at, of, j) * (1.0f / UNLIKE), broadcast(MOST_UNLIKE));
-            const vec odds = capped * capped, unlike = odds / (1.0f + odds);
-            const auto add = [&](int plane, ivec chosen, vec value) {
-              float *const to = added + plane * TILE + j;
-              store(to, load<vec>(to) + (chosen ? value : vec{}));
-            };
-            const ivec compared = known(at, of, j), inner = compared & (ring > 1.0f) & (ring <= (float)RIM);
-            const ivec outer = compared & (ring == (float)RINGS);
-            add(0, inner, unlike), add(1, inner, broadcast(1.0f));
-            add(2, outer, unlike), add(3, outer, broadcast(1.0f));
-          },
-          [&](int y) { add_cells(sums, tile, y, added); });
+      vec unlike[2], all[2];
+      const auto prepare = [&](int y) {
+        read(means, tile, y, of);
+        for (int part = 0; part < 2; part++) unlike[part] = all[part] = vec{};
+      };
+      const auto add = [&](int j, size_t at) {
+        const vec ring = load<vec>(&ring_[at]);
+        const vec capped = min(deviation(at, of, j) * (1.0f / UNLIKE), broadcast(MOST_UNLIKE));
+        const vec odds = capped * capped;
+        const ivec compared = known(at, of, j);
+        const ivec parts[] = {compared & (ring > 1.0f) & (ring <= (float)RIM), compared & (ring == (float)RINGS)};
+        for (int part = 0; part < 2; part++) {
+          unlike[part] += parts[part] ? odds / (1.0f + odds) : vec{};
+          all[part] += parts[part] ? broadcast(1.0f) : vec{};
+        }
+      };
+      const auto end = [&](int) {
+        for (int part = 0; part < 2; part++) {
+          of_tiles[tile][part].unlike += reduce_add(unlike[part]);
+          of_tiles[tile][part].all += reduce_add(all[part]);
+        }
+      };
+      each_vector(tile, SAMPLED, prepare, add, end);
     });
-    return sums;
+    Counts counts;
+    for (const Counts &of_tile : of_tiles)
+      for (int part = 0; part < 2; part++)
+        counts[part].unlike += of_tile[part].unlike, counts[part].all += of_tile[part].all;
+    return counts;
   }
 
-  bool has_missed(const std::vector<float> &counts, size_t cell) const {
-    const float found = counts[cell], all = counts[cells_ + cell], compared = counts[3 * cells_ + cell];
-    const float usual = counts[2 * cells_ + cell] / std::max(compared, 1e-9f);
-    const float excess = (found / std::max(all, 1e-9f) - usual) / std::max(1.0f - usual, 0.1f);
-    const float side = CELL * (2 * PLACE + 1), pixels = all * side * side;
-    return compared > COMPARED * all && excess * std::min(pixels * (1.0f / COUNTED), 1.0f) > MISSED;
+  // Step 4: pixels by which near surfaces grow everywhere.
+  static float growth(const Counts &counts) {
+    const auto &[rim, background] = counts;
+    const double excess = (rim.share() - background.share()) / std::max(1.0 - background.share(), 0.1);
+    const float share = (float)(excess * rim.all / (rim.all + COUNTED));
+    return GROWTH_PX * clamp01((share - MISSED) / (MANY_MISSED - MISSED));
   }
 
-  // Step 5: pixels that may be given to the near surface. `ring_` becomes 1 for them, 0 for others.
-  std::vector<std::pair<int, int>> unlike_pixels(const std::vector<float> &means, const std::vector<uint8_t> &missed) {
+  // Step 5: `ring_` becomes the distance up to which the near surface may grow onto a pixel. Lists these pixels.
+  std::vector<std::pair<int, int>> wanted_pixels(const std::vector<float> &means, float everywhere) {
     each_tile([&](int tile) {
       Background of(channels_);
       const auto prepare = [&](int y) {
@@ -372,12 +380,8 @@ class Missed {
         read(means, tile, y, of);
       };
       const auto mark = [&](int j, size_t at) {
-        const ivec may = known(at, of, j) & (deviation(at, of, j) > TAKEN);
-        store(&ring_[at], may ? broadcast(1.0f) : vec{});
-        for (int k = 0; k < LANES; k++) {
-          const size_t y = at / pitch_, x = at % pitch_ + k;
-          if (may[k] && !missed[y / CELL * columns_ + x / CELL]) ring_[at + k] = 0;
-        }
+        const vec smooth = load<vec>(of.is_smooth() + j) * GROWTH_OVER_SMOOTH_PX;
+        store(&ring_[at], known(at, of, j) ? max(smooth, broadcast(everywhere)) : vec{});
       };
       each_vector(tile, 1, prepare, mark, [](int) {});
     });
@@ -388,26 +392,24 @@ class Missed {
     return pixels;
   }
 
-  // The rest of step 5. Few pixels are taken, so that lists of them are processed.
-  bool take(const std::vector<float> &means, const std::vector<float> &counts) {
-    std::vector<uint8_t> missed(cells_);
-    for (size_t cell = 0; cell < cells_; cell++) missed[cell] = has_missed(counts, cell);
-    if (std::none_of(missed.begin(), missed.end(), [](uint8_t has) { return has; })) return false;
-    std::vector<std::pair<int, int>> wanted = unlike_pixels(means, missed), taken;
+  // Lets near surfaces grow. Lists of pixels are processed: those beside pixels that the last step has taken.
+  bool grow(const std::vector<float> &means, float everywhere) {
+    std::vector<std::pair<int, int>> wanted = wanted_pixels(means, everywhere), taken;
     if (wanted.empty()) return false;
     memcpy(map_.out, map_.nearness, area_ * sizeof(float));
     bool changed = false;
-    for (int round = 0; round < REACH && !wanted.empty(); round++) {
+    for (int grown = 0; grown < (int)GROWTH_PX && !wanted.empty(); grown += GROWTH_STEP_PX) {
       taken.clear();
       for (const auto &[y, x] : wanted) {
+        float &may = ring_[(size_t)y * pitch_ + x];
+        may = std::fabs(may);
+        if (!(may > (float)grown)) continue;
         float nearest = FAR_PX;
         each_beside(y, x, [&](int v, int u) {
           const float coc = map_.out[(size_t)v * width_ + u];
           if (is_valid(coc)) nearest = std::min(nearest, coc);
         });
-        const float coc = map_.out[(size_t)y * width_ + x];
-        float &may = ring_[(size_t)y * pitch_ + x];
-        if (may == 0 || !is_beyond(std::fabs(coc), nearest)) continue;
+        if (!is_beyond(std::fabs(map_.out[(size_t)y * width_ + x]), -nearest)) continue;
         may = 0;
         near_[(size_t)y * pitch_ + x] = nearest;
         taken.push_back({y, x});
@@ -416,7 +418,10 @@ class Missed {
       for (const auto &[y, x] : taken) map_.out[(size_t)y * width_ + x] = near_[(size_t)y * pitch_ + x];
       for (const auto &[y, x] : taken)
         each_beside(y, x, [&](int v, int u) {
-          if (ring_[(size_t)v * pitch_ + u] != 0) wanted.push_back({v, u});
+          float &may = ring_[(size_t)v * pitch_ + u];
+          if (!(may > 0)) return;
+          may = -may;  // is listed
+          wanted.push_back({v, u});
         });
       changed |= !taken.empty();
     }
@@ -425,8 +430,9 @@ class Missed {
 
   template <typename Visit>
   void each_beside(int y, int x, const Visit &visit) const {
-    for (int v = std::max(y - 1, 0); v <= std::min(y + 1, height_ - 1); v++)
-      for (int u = std::max(x - 1, 0); u <= std::min(x + 1, width_ - 1); u++) visit(v, u);
+    const int reach = GROWTH_STEP_PX;
+    for (int v = std::max(y - reach, 0); v <= std::min(y + reach, height_ - 1); v++)
+      for (int u = std::max(x - reach, 0); u <= std::min(x + reach, width_ - 1); u++) visit(v, u);
   }
 
   const torchdof_map &map_;

@@ -5,6 +5,7 @@
 #pragma once
 #include "constants/composite.h"
 #include "constants/disocclusion.h"
+#include "constants/doubt.h"
 #include "constants/frame.h"
 #include "constants/layer_weights.h"
 #include "constants/matting.h"
@@ -15,6 +16,8 @@ namespace torchdof {
 // Constants of Python modules, which give their meanings, units and effects; here with the type of the computations.
 constexpr float KNOWN = constants::composite::KNOWN;
 constexpr float SAME_BLUR = constants::matting::SAME_BLUR;
+constexpr float SHARPER = constants::doubt::SHARPER;
+constexpr float APART_PX = constants::doubt::APART_PX;
 constexpr float BEHIND_PX = constants::disocclusion::BEHIND_PX;
 constexpr float OWN_SLOPE = constants::disocclusion::OWN_SLOPE;
 constexpr float FOOT = constants::layer_weights::FOOT;
@@ -39,6 +42,13 @@ inline auto within(V v) {
 template <typename V>
 inline V apart_px(V near, V far) {
   return far - near - SAME_BLUR * min(max(near, -near), max(far, -far));
+}
+
+// Whether a pixel with this blur is clearly less blurred than, and thus behind, a near surface with that blur: blur <
+// SHARPER near - APART_PX. render/surfaces/doubt.py, is_beyond.
+template <typename V>
+inline auto is_beyond(V blur, V near) {
+  return blur < SHARPER * near - APART_PX;
 }
 
 // A pixel between two surfaces, at n from 0 at the far one to 1 at the near one, counts to the near one by clamp(4 n -

@@ -26,8 +26,9 @@ from ...validation import ends
 from ..engines.ops import EAGER, Ops
 from ..engines.traced import is_compiled, one_operator
 from ..rules import active
+from .doubt import blurred_in_doubt, doubt_of
 from .missed import completed
-from .windows import highest
+from .windows import highest, mean_around
 
 __all__ = ["STEP_PX", "judged", "mended", "repair", "repair_edges"]
 
@@ -274,6 +275,7 @@ def _repair(
        beside them.
     5. Give selected pixels the nearness of their surface, on ramps in proportion to the evidence.
     6. In soft maps, remove the ringing of interpolation beside steps, and correct lamps of a few pixels.
+    7. In soft maps of the coc that the image contradicts, blur the edges a little.
     """
     rules = active()
     if of_coc:
@@ -370,6 +372,11 @@ def _repair(
         out = torch.where(is_soft, _without_ringing(out, valid, step), out)
     if rules.soft_lamps:
         out = _lift_lamps(light, given, out, step, is_soft, sigma, lost_px, ops)
+    if auto and of_coc and rules.in_doubt:
+        doubt = torch.where(is_soft, doubt_of(clear, agreed), 0.0)
+        if is_traced() or (doubt > 0).any():
+            blurred = blurred_in_doubt(given, out, valid, doubt)
+            out = ops.equal_unless(lambda: (doubt > 0).any(), blurred, out)
     out = torch.where(valid, out, nearness)
     return -out if of_coc else out
 
@@ -429,7 +436,7 @@ def _find(nearness: Tensor, valid: Tensor, step: Tensor) -> _Edges:
     slope, jump, steepness = _slopes(nearness, valid)
     span = highest(ends, _REACH).sum(1, keepdim=True)
     # a ramp is short and has flat places around it; a slope has none
-    flattest = -highest(-_mean(slope, 2), _FLAT_REACH)
+    flattest = -highest(-mean_around(slope, 2), _FLAT_REACH)
     is_ramp = (slope > 0.1 * step) & (slope > _SHALLOW * span) & (span > step) & (flattest < _FLAT * slope) & valid
 
     # the surfaces at both ends of a ramp: extremes spread along it pixel by pixel
@@ -455,7 +462,7 @@ def _find(nearness: Tensor, valid: Tensor, step: Tensor) -> _Edges:
     gap = near - far
     is_edge = (is_ramp | (ring <= _RINGS)) & (gap > step) & valid
 
-    mean = _mean(functional.pad(nearness, (2,) * 4, mode="replicate"), 2)
+    mean = mean_around(functional.pad(nearness, (2,) * 4, mode="replicate"), 2)
     right, down = mean[..., 2:-2, 4:] - mean[..., 2:-2, :-4], mean[..., 4:, 2:-2] - mean[..., :-4, 2:-2]
     lead, tie = right.abs() - down.abs(), _TIE * gap
     across = torch.where(lead > tie, right.sign(), 0.0)
@@ -641,7 +648,7 @@ def _lift_lamps(
     The fit ``nearness = a + b blurred(cover)`` gives the lamp ``a + b``; its cover is its light over its brightest.
     """
     brightest = light.amax(1, keepdim=True)
-    usual = _mean(brightest.sqrt(), _USUAL_REACH) ** 2
+    usual = mean_around(brightest.sqrt(), _USUAL_REACH) ** 2
     span = highest(torch.cat([nearness, -nearness], 1), _REACH).sum(1, keepdim=True)
     around = highest(brightest, _LAMP_REACH)
     is_lamp = (brightest > 4.0 * usual) & (brightest > 0.1 * around) & (span > 0.5 * step) & is_soft
@@ -723,12 +730,6 @@ def _slopes(nearness: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         jump.append(torch.maximum(before, after) - least[-1])
     steepness = torch.stack([torch.hypot(a, b) for a in sides[0] for b in sides[1]]).mean(0)
     return torch.maximum(*least), torch.maximum(*jump), steepness
-
-
-def _mean(values: Tensor, reach: int) -> Tensor:
-    side = 2 * reach + 1
-    rows = functional.avg_pool2d(functional.pad(values, (reach,) * 4, mode="replicate"), (1, side), stride=1)
-    return functional.avg_pool2d(rows, (side, 1), stride=1)
 
 
 def _blurred(values: Tensor, sigma: Tensor) -> Tensor:

@@ -1,11 +1,12 @@
-"""Gives fine parts of a blurred foreground to it that the map of depth misses: hair, fur, twigs.
+"""Gives to a blurred foreground what the map of depth misses of it: hair, fur, twigs, rims.
 
 A map often ends some pixels before the last hairs of its foreground. Left with the background they would stay sharp,
 before a smooth background the most visible fault of all. This module compares the pixels beside a more blurred near
-surface with the background farther from it. Where many of those near the edge are unlike the background and few of
-those farther away are, the map has missed parts of the near surface: unlike pixels connected to it get its coc.
-A map with exact edges stays unchanged, as things of the background do not prefer places beside the edge. Cells of
-pixels are counted from the top left, so that a few pixels of a mirrored frame may be decided otherwise.
+surface with the background farther from it. If many of those near the edges are unlike the background and few of those
+farther away are, the map has missed parts of its foregrounds, which then grow. A foreground also grows where the
+background is smooth, which is not seen there. A map with exact edges stays unchanged, as things of the background do
+not prefer places beside an edge. Cells of pixels are counted from the top left, so that a few pixels of a mirrored
+frame may be decided otherwise.
 """
 
 import itertools
@@ -19,27 +20,27 @@ from ...tensors import is_in_memory, is_traced
 from ..engines.ops import EAGER, Ops
 from ..engines.traced import is_compiled, one_operator
 from ..rules import active
+from .doubt import is_beyond
 from .windows import highest
 
 __all__ = ["completed"]
 
-_SHARPER = 0.7  # largest blur of a pixel beyond an edge, over that of the near surface; larger: edges within slopes
-_APART_PX = 2.0  # px; subtracted from it; larger: fewer edges
-_RINGS_PX = (1, 2, 3, 7, 14)  # px; distance from the near surface at which each ring ends
+_RINGS_PX = (1, 2, 3, 10, 22)  # px; distance from the near surface at which each ring ends
 _RIM = 3  # rings in which the map may have missed something; the first is mixed by the image itself
 _SAMPLED = 2  # every second row is compared; larger: faster, coarser
-_REACH = 10  # px; farthest part that is given to the near surface; larger: longer hairs
 _CELL = 4  # px; side of the cells in which pixels are summed
 _NEARBY = 2  # cells; half the width of the window of the background around a pixel; larger: smoother backgrounds
-_PLACE = 12  # cells; half the width of the window in which pixels are counted; larger: fewer wrong places
 _GRAIN = 4e-4  # least variance of the square root of light, over its square; larger: fewer pixels are unlike
+_SMOOTH = 5e-4  # the same variance below which the background is smooth; larger: more backgrounds
 _OUTLIER = 9.0  # squared deviation at which a sample of the background counts by a quarter
 _UNLIKE = 9.0  # squared deviation at which a pixel counts by half as unlike the background
 _MOST_UNLIKE = 1e3  # largest deviation that is compared with `_UNLIKE`, whose square is finite
-_TAKEN = 2.25  # the same from which a pixel is given to the near surface, where the map has missed parts
-_MISSED = 0.25  # share of unlike pixels, above that of the background, from which the map has missed parts
-_COUNTED = 200.0  # sampled pixels of a rim from which the share counts in full; larger: fewer wrong places
-_COMPARED = 0.2  # fewest background pixels, over those of the rim
+_MISSED = 0.08  # share of unlike pixels, above that of the background, from which the map has missed parts
+_MANY_MISSED = 0.15  # the same from which near surfaces grow by `_GROWTH_PX`
+_COUNTED = 300.0  # compared pixels of a frame at which the share counts by half; larger: small edges count less
+_GROWTH_PX = 22.0  # px; by which near surfaces grow at most; larger: longer hairs
+_GROWTH_OVER_SMOOTH_PX = 10.0  # px; by which they grow over a smooth background
+_GROWTH_STEP_PX = 2  # px; they grow in steps, each onto pixels that are much less blurred
 _ON_SURFACE = 0.25  # deviation of the coc of samples, over the difference of both surfaces, up to which they are one
 _LEAST_SAMPLES = 0.006  # fraction of the window that samples fill
 _FAR_PX = 1e9  # px; a coc that marks pixels without a near surface
@@ -48,7 +49,7 @@ _BRIGHTEST = 1e15  # largest light that is compared
 
 
 def completed(image: Tensor, coc_px: Tensor, before: Tensor, ops: Ops = EAGER) -> Tensor:
-    """Gives missed fine parts of blurred foregrounds the coc of the foreground.
+    """Lets blurred foregrounds grow by what the map misses of them.
 
     Maps that the repair of edges has left as they are count as exact, and stay.
 
@@ -57,9 +58,9 @@ def completed(image: Tensor, coc_px: Tensor, before: Tensor, ops: Ops = EAGER) -
        pass gives less weight to pixels that are far from the first mean.
     3. A pixel's squared deviation ``z^2`` from that mean, over the variance; it is unlike the background by
        ``z^4 / (z^4 + 81)``.
-    4. The map has missed parts where the mean of this in the second and third ring exceeds that in the last one:
-       ``(inner - outer) / (1 - outer) >`` :data:`_MISSED`.
-    5. There, pixels with ``z^2 >`` :data:`_TAKEN` that touch the near surface, or one another, get its coc.
+    4. The mean of this in the second and third ring of the whole frame, less that in the last one: ``(inner - outer) /
+       (1 - outer)``. From :data:`_MISSED` on, near surfaces grow, at :data:`_MANY_MISSED` by :data:`_GROWTH_PX`.
+    5. Where the background varies by less than :data:`_SMOOTH`, they grow by :data:`_GROWTH_OVER_SMOOTH_PX` at least.
 
     Args:
         image: ``[B, C, H, W]``, linear light; its scale does not matter if it is above 1e-8.
@@ -98,7 +99,7 @@ def _completed(image: Tensor, coc_px: Tensor, is_inexact: Tensor, ops: Ops) -> T
     near, ring = torch.full_like(coc, -_FAR_PX), torch.zeros_like(coc)
     for k, (start_px, end_px) in enumerate(itertools.pairwise((0, *_RINGS_PX)), 1):
         around = highest(values, end_px - start_px)
-        is_new = (ring == 0) & _is_beyond(blur, around)
+        is_new = (ring == 0) & is_beyond(blur, around)
         near, ring = torch.where(is_new, around, near), torch.where(is_new, float(k), ring)
         values = near
     has_edges = ring.any()
@@ -108,33 +109,26 @@ def _completed(image: Tensor, coc_px: Tensor, is_inexact: Tensor, ops: Ops) -> T
     samples, on_surface = ((ring > _RIM) & is_sampled).to(coc.dtype), torch.where(ring > 0, coc, 0.0)
     deviation = _compared(light, on_surface, samples)[0]
     weight = samples / (1.0 + deviation / _OUTLIER).square()
-    deviation, middle, spread, seen = _compared(light, on_surface, weight)
+    deviation, is_smooth, middle, spread, seen = _compared(light, on_surface, weight)
     is_one = spread.sqrt() + (middle - on_surface).abs() < _ON_SURFACE * (on_surface + near)
     known = (ring > 0) & (seen > _LEAST_SAMPLES) & is_one
     odds = (deviation / _UNLIKE).clamp(max=_MOST_UNLIKE).square()
-    unlike = odds / (1.0 + odds)
     compared = known & is_sampled
     parts = (compared & (ring > 1) & (ring <= _RIM), compared & (ring == len(_RINGS_PX)))
-    inner, outer = (torch.cat([part * unlike, part.to(unlike.dtype)], 1) for part in parts)
-    (found, count), (usual, of_usual) = (_around(t, _PLACE).split(1, 1) for t in (inner, outer))
-    usual = usual / of_usual.clamp_min(1e-9)
-    excess = (found / count.clamp_min(1e-9) - usual) / (1.0 - usual).clamp_min(0.1)
-    pixels = count * float((_CELL * (2 * _PLACE + 1)) ** 2)
-    excess = excess * (pixels / _COUNTED).clamp(max=1.0) * (of_usual > _COMPARED * count)
-    may = known & (deviation > _TAKEN) & (_of_cells(excess, ring) > _MISSED)
-    if not is_traced() and not may.any():
+    sums = [torch.cat([part * odds / (1.0 + odds), part], 1).sum((2, 3), keepdim=True).split(1, 1) for part in parts]
+    (found, count), (usual, of_usual) = sums
+    usual = usual / of_usual.clamp_min(1.0)
+    excess = (found / count.clamp_min(1.0) - usual) / (1.0 - usual).clamp_min(0.1) * count / (count + _COUNTED)
+    growth = _GROWTH_PX * ((excess - _MISSED) / (_MANY_MISSED - _MISSED)).clamp(0.0, 1.0)
+    growth = torch.where(known, torch.where(is_smooth > 0, growth.clamp_min(_GROWTH_OVER_SMOOTH_PX), growth), 0.0)
+    if not is_traced() and not (growth > 0).any():
         return coc_px
 
-    for _ in range(_REACH):
-        around = highest(surface, 1)
-        is_taken = may & _is_beyond(blur, around)
-        surface, may = torch.where(is_taken, around, surface), may & ~is_taken
+    for grown in range(0, int(_GROWTH_PX), _GROWTH_STEP_PX):
+        around = highest(surface, _GROWTH_STEP_PX)
+        is_taken = (growth > grown) & is_beyond(blur, around)
+        surface, growth = torch.where(is_taken, around, surface), torch.where(is_taken, 0.0, growth)
     return ops.equal_unless(lambda: has_edges, torch.where(is_valid, -surface, coc_px), coc_px)
-
-
-def _is_beyond(blur: Tensor, near: Tensor) -> Tensor:
-    """Whether a pixel with this blur is less blurred than, and thus behind, a near surface with that blur."""
-    return blur < _SHARPER * near - _APART_PX
 
 
 # Compiled graphs do not support steps that depend on the data.
@@ -143,17 +137,23 @@ def _operator(image: Tensor, coc_px: Tensor, is_inexact: Tensor) -> Tensor:
     return _completed(image, coc_px, is_inexact, EAGER).clone(memory_format=torch.contiguous_format)
 
 
-def _compared(light: Tensor, coc: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Squared deviation of each pixel from weighted samples around it, mean and variance of their coc, their weight."""
+def _compared(light: Tensor, coc: Tensor, weight: Tensor) -> tuple[Tensor, ...]:
+    """Compares pixels with weighted samples around them.
+
+    Returns:
+        The squared deviation of each pixel; whether the samples are smooth, 0 or 1; mean and variance of their coc; and
+        their weight.
+    """
     colours, square = light.shape[1], light.square().mean(1, keepdim=True)
     sums = _around(weight * torch.cat([torch.ones_like(coc), light, square, coc, coc * coc], 1), _NEARBY)
     seen, means = sums.split([1, colours + 3], 1)
     mean, square, middle, of_coc = (means / seen.clamp_min(1e-9)).split([colours, 1, 1, 1], 1)
     bright = mean.square().mean(1, keepdim=True)
     variance = (square - bright).clamp_min(0.0) + _GRAIN * bright + 1e-12
-    maps = torch.cat([mean, variance, middle, (of_coc - middle.square()).clamp_min(0.0), seen], 1)
-    mean, variance, middle, spread, seen = _of_cells(maps, light).split([colours, 1, 1, 1, 1], 1)
-    return (light - mean).square().mean(1, keepdim=True) / variance, middle, spread, seen
+    is_smooth = (variance < _SMOOTH * bright).to(coc.dtype)
+    maps = torch.cat([mean, variance, is_smooth, middle, (of_coc - middle.square()).clamp_min(0.0), seen], 1)
+    mean, variance, *others = _of_cells(maps, light).split([colours, 1, 1, 1, 1, 1], 1)
+    return (light - mean).square().mean(1, keepdim=True) / variance, *others
 
 
 def _around(values: Tensor, reach: int) -> Tensor:

@@ -11,3 +11,10 @@ def highest(values: Tensor, reach: int) -> Tensor:
         return functional.max_pool2d(values, side, stride=1, padding=reach)
     rows = functional.max_pool2d(values, (1, side), stride=1, padding=(0, reach))
     return functional.max_pool2d(rows, (side, 1), stride=1, padding=(reach, 0))
+
+
+def mean_around(values: Tensor, reach: int) -> Tensor:
+    """The mean of these values, with the border's continued beyond the frame."""
+    side = 2 * reach + 1
+    rows = functional.avg_pool2d(functional.pad(values, (reach,) * 4, mode="replicate"), (1, side), stride=1)
+    return functional.avg_pool2d(rows, (side, 1), stride=1)

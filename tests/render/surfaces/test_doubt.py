@@ -1,0 +1,101 @@
+"""Maps that the image contradicts: their edges are blurred, maps that are only too thin are not in doubt."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+from tests.scenes import furry_post, wavy_post
+from torchdof import native
+from torchdof.render.rules import without
+from torchdof.render.surfaces import edges
+from torchdof.render.surfaces.doubt import blurred_in_doubt, doubt_of
+
+COMPILED = pytest.mark.skipif(not native.chosen(), reason="the compiled engine is not built here")
+
+
+def mended(image: Tensor, coc_px: Tensor) -> Tensor:
+    return edges.mended(image, coc_px, "auto")
+
+
+def test_nothing_beside_a_blurred_foreground_is_sharp_where_the_image_contradicts_the_map(engine: str) -> None:
+    image, given, _ = wavy_post()
+    coc = mended(image, given)[0, 0]
+    post = coc < -11.0
+    beside = torch.zeros_like(post)
+    beside[:, 1:-1] = ~post[:, 1:-1] & (post[:, 2:] | post[:, :-2])
+    assert int(beside.sum()) > 300
+    assert float(coc[beside].abs().min()) > 2.0
+    assert float(coc[:, :30].abs().max()) < 1.0  # far from it
+
+
+def test_blur_only_rises_and_each_pixel_keeps_its_side_of_the_focus() -> None:
+    image, given, _ = wavy_post()
+    with without([]):
+        coc = mended(image, given)
+    with without(["in_doubt"]):
+        before = mended(image, given)
+    assert int((coc != before).sum()) > 1000
+    assert bool((coc.abs() >= before.abs()).all())
+    assert coc.sign().equal(before.sign())
+
+
+@pytest.mark.parametrize(
+    ("near", "far", "doubt"), [(0.0, 0.9, 0.0), (0.9, 0.0, 0.0), (0.2, 0.1, 1.0), (0.02, 0.3, 0.0), (0.04, 0.04, 0.6)]
+)
+def test_a_map_is_in_doubt_if_both_sides_of_its_edges_are_contradicted(near: float, far: float, doubt: float) -> None:
+    clear = torch.tensor([[1e4], [1e4]])
+    assert_close(
+        doubt_of(clear, clear * (1.0 - torch.tensor([[near], [far]]))), torch.tensor([doubt]), atol=0.1, rtol=0
+    )
+
+
+def test_few_pixels_put_no_map_in_doubt() -> None:
+    clear = torch.tensor([[3.0], [3.0]])
+    assert doubt_of(clear, 0.9 * clear).item() == 0.0
+
+
+def test_a_map_that_is_only_too_thin_is_not_in_doubt() -> None:
+    image, given, _ = furry_post(noise=0.1)
+    with without([]):
+        coc = mended(image, given)
+    with without(["in_doubt"]):
+        assert coc.equal(mended(image, given))
+
+
+def test_each_item_of_a_batch_has_its_own_doubt(engine: str) -> None:
+    scenes = [scene[:2] for scene in (wavy_post(), furry_post())]
+    images, maps = (torch.cat(t) for t in zip(*scenes, strict=True))
+    together = mended(images, maps)
+    for k, scene in enumerate(scenes):
+        assert together[k : k + 1].equal(mended(*scene))
+
+
+def test_invalid_values_stay_and_their_kind_affects_nothing(engine: str) -> None:
+    image, given, _ = wavy_post()
+    holes = torch.rand(given.shape, generator=torch.Generator().manual_seed(2)) < 0.01
+    results = [mended(image, torch.where(holes, value, given)) for value in (math.nan, -math.inf, 3e38)]
+    for result in results:
+        assert result[~holes].equal(results[0][~holes])
+
+
+@COMPILED
+@pytest.mark.parametrize("size", [(1, 9), (40, 97), (96, 96), (97, 193), (224, 160)])
+def test_engines_agree(size: tuple[int, int]) -> None:
+    image, given, _ = (torch.cat([t, t], -1)[..., : size[0], : size[1]].contiguous() for t in wavy_post())
+    plain = edges._repair(image, given, torch.tensor(edges.STEP_PX), True, True)
+    fast = native.repair_edges(image[0], given[0, 0], torch.tensor(edges.STEP_PX), True, True)
+    assert_close(fast, plain[0, 0], rtol=0, atol=1e-3)
+
+
+def test_full_doubt_blurs_beside_a_foreground_by_half_its_blur_and_fades() -> None:
+    given = torch.full((1, 1, 9, 40), -0.1)
+    repaired = given.clone()
+    repaired[..., :20] = 10.0
+    blurred = blurred_in_doubt(given, repaired, torch.ones_like(given) > 0, torch.ones(1, 1, 1, 1))[0, 0, 4]
+    assert_close(blurred[:20], repaired[0, 0, 4, :20])
+    expected = torch.tensor([2 * k / 11 * 5.0 for k in (5, 4, 3, 2, 1)])  # k of 11 columns are those of the foreground
+    assert_close(-blurred[20:25], expected)
+    assert_close(blurred[25:], given[0, 0, 4, 25:])

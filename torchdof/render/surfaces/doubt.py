@@ -1,0 +1,78 @@
+"""Blurs the edges of depth maps that the image contradicts.
+
+Estimated depth often has its edges some pixels beside those of the image, on either side. Decisions pixel by pixel then
+leave sharp scraps beside blurred foregrounds, and rough rims on what is in focus. How many of the clearest pixels have
+the colour of the surface across the edge tells how far a map can be trusted. In doubt, what lies beside a blurred
+foreground is blurred too, less with every pixel of distance, and everything at an edge is a little blurred.
+"""
+
+import torch
+from torch import Tensor
+
+from .windows import highest, mean_around
+
+__all__ = ["blurred_in_doubt", "is_beyond"]
+
+_CONTRADICTED = 0.03  # share of clear pixels that contradict the map, on either side, from which it is in doubt
+_OFTEN_CONTRADICTED = 0.045  # the same from which it is fully in doubt
+_ASSUMED = 15.0  # pixels that are assumed to agree with the map; larger: maps with few edges are trusted
+_MOVED_PX = 1.0  # px; change of the coc from which the repair of edges has moved a pixel
+_REACH = 5  # px; distance from a blurred foreground at which its blur has faded; larger: fewer scraps, softer pictures
+_OF_NEAR = 0.5  # blur beside it in full doubt, over its own; larger: the same
+_LEAST_BLUR_PX = 1.5  # px; least blur at an edge in full doubt
+_AT_EDGE_PX = 2  # px; half the width of the window in which this blur fades
+_EDGE_REACH = 3  # px; distance at which surfaces on both sides of an edge are found
+_LEAST_STEP_PX = 3.0  # px; smallest difference in coc at such an edge
+_SHARPER = 0.7  # largest blur of a pixel beyond an edge, over that of the near surface; larger: edges within slopes
+_APART_PX = 2.0  # px; subtracted from it; larger: fewer edges
+_NEVER = -1e9  # nearness of invalid pixels
+
+
+def is_beyond(blur_px: Tensor, near_px: Tensor) -> Tensor:
+    """Whether a pixel with this blur is clearly less blurred than, and thus behind, a near surface with that blur."""
+    return blur_px < _SHARPER * near_px - _APART_PX
+
+
+def doubt_of(clear: Tensor, agreed: Tensor) -> Tensor:
+    """How much a map is in doubt.
+
+    Args:
+        clear: Weights of clear pixels of near and far surfaces, ``[2, ...]``.
+        agreed: Those of pixels that have the colour of the surface that the map gives them.
+
+    Returns:
+        0 to 1, ``[...]``: the less contradicted side counts, because colours of a map that is only too thin, or too
+        wide, contradict it on one side, and the repair of edges cures that.
+    """
+    share = ((clear - agreed) / (clear + _ASSUMED)).amin(0)
+    return ((share - _CONTRADICTED) / (_OFTEN_CONTRADICTED - _CONTRADICTED)).clamp(0.0, 1.0)
+
+
+def blurred_in_doubt(given: Tensor, repaired: Tensor, valid: Tensor, doubt: Tensor) -> Tensor:
+    """Raises the blur beside edges that the repair has moved.
+
+    1. Beside a near surface with blur r, the blur is at least ``doubt r / 2``. This fades with the share of the near
+       surface in the 11 x 11 pixels around, from a half to 0.
+    2. At any edge, it is at least ``1.5 doubt`` pixels, which fades within a few pixels.
+
+    Args:
+        given: Negated coc in pixels before the repair, ``[B, 1, H, W]``.
+        repaired: The same after it.
+        valid: Whether a pixel is valid; others stay.
+        doubt: 0 to 1, ``[B, 1, 1, 1]``.
+
+    Returns:
+        Negated coc, ``[B, 1, H, W]``; pixels keep their side of the focus.
+    """
+    moved = ((repaired - given).abs() > _MOVED_PX).to(repaired.dtype)
+    nearness = torch.where(valid, repaired, _NEVER)
+    near = highest(nearness, _REACH)
+    is_near = (nearness > 0.5 * near.clamp_min(1.0)).to(nearness.dtype)
+    is_beside = is_beyond(nearness.abs(), near) & (highest(moved, _REACH) > 0)
+    beside = torch.where(is_beside, _OF_NEAR * near * (2.0 * mean_around(is_near, _REACH)).clamp(max=1.0), 0.0)
+
+    step = highest(nearness, _EDGE_REACH) + highest(torch.where(valid, -nearness, _NEVER), _EDGE_REACH)
+    at_edge = torch.where(step > _LEAST_STEP_PX, _LEAST_BLUR_PX * mean_around(highest(moved, 1), _AT_EDGE_PX), 0.0)
+    least = doubt * torch.maximum(beside, at_edge)
+    is_sharper = valid & (nearness.abs() < least)
+    return torch.where(is_sharper, torch.where(nearness > 0, least, -least), repaired)
