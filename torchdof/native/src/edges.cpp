@@ -315,9 +315,9 @@ class Repair {
     decide(groups);
     const float lost_px = move(groups, is_soft);
     if (is_soft) remove_ringing();
-    if (is_soft) lift_lamps(blur(), lost_px);
-    if (const float doubt = doubt_of(agreement); is_soft && map_.automatic && map_.is_coc && doubt > 0)
-      blur_in_doubt(doubt);
+    const float doubt = map_.automatic && is_soft ? doubt_of(agreement) : 0.0f;
+    if (is_soft && doubt < 1) lift_lamps(blur(), lost_px, doubt);
+    if (map_.is_coc && doubt > 0) blur_in_doubt(doubt);
     return true;
   }
 
@@ -1308,10 +1308,10 @@ class Repair {
   }
 
   // Raises the nearness of lamps of a few pixels, which a soft map averages with their surroundings.
-  void lift_lamps(float sigma, float lost_px) const {
+  void lift_lamps(float sigma, float lost_px, float doubt) const {
     const std::vector<float> weights = even_window();
-    const float is_lost =
-        clamp01(2.4f + 2.5f * lost_px);  // 0 if the map's near surfaces are 1 px too wide: then it has lost no lamps
+    // 0 if the map's near surfaces are 1 px too wide: then it has lost no lamps
+    const float is_lost = clamp01(2.4f + 2.5f * lost_px) * (1.0f - doubt);
     const std::vector<Group> all_parts = tiles();
     const int reach = blur_reach(sigma);
     parallel((int)all_parts.size(), [&](int g) {

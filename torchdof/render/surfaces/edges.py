@@ -370,10 +370,10 @@ def _repair(
     out = pixels.put(given, edge_pixels, torch.lerp(own, torch.where(shows_near, near, far), moved))
     if rules.ringing:
         out = torch.where(is_soft, _without_ringing(out, valid, step), out)
+    doubt = torch.where(is_soft, doubt_of(clear, agreed), 0.0) if auto and rules.in_doubt else torch.zeros_like(sigma)
     if rules.soft_lamps:
-        out = _lift_lamps(light, given, out, step, is_soft, sigma, lost_px, ops)
+        out = _lift_lamps(light, given, out, step, is_soft, sigma, lost_px, doubt, ops)
     if auto and of_coc and rules.in_doubt:
-        doubt = torch.where(is_soft, doubt_of(clear, agreed), 0.0)
         if is_traced() or (doubt > 0).any():
             blurred = blurred_in_doubt(given, out, valid, doubt)
             out = ops.equal_unless(lambda: (doubt > 0).any(), blurred, out)
@@ -641,9 +641,12 @@ def _lift_lamps(
     is_soft: Tensor,
     sigma: Tensor,
     lost_px: Tensor,
+    doubt: Tensor,
     ops: Ops,
 ) -> Tensor:
     """Raises the nearness of lamps of a few pixels, which a soft map averages with their surroundings.
+
+    A map in doubt stays: what looks like a lamp may be a bright spot of its surroundings, which would become sharp.
 
     The fit ``nearness = a + b blurred(cover)`` gives the lamp ``a + b``; its cover is its light over its brightest.
     """
@@ -662,7 +665,7 @@ def _lift_lamps(
     total, level, fit = pixels.pick(of_lamps, pixels.around(lamp_pixels, nearness, _LAMP_REACH)).sum(1).unbind(0)
     level, fit = (values / total.clamp_min(1e-9) for values in (level, fit))
     # a map whose near surfaces are not too thin has lost no lamps: 0 where they are 1 px too wide
-    is_lost = (2.4 + 2.5 * lost_px).clamp(0.0, 1.0).flatten()
+    is_lost = ((2.4 + 2.5 * lost_px).clamp(0.0, 1.0) * (1.0 - doubt)).flatten()
     fit = fit * is_lost[lamp_pixels // nearness[0].numel()]
     own = pixels.pick(repaired, lamp_pixels)[0]
     return pixels.put(repaired, lamp_pixels, own + fit * (level - own).clamp_min(0.0))
