@@ -1,5 +1,6 @@
 """Exported files repair depth edges and render the pictures of the PyTorch engine."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.scenes import furry_post
+from tests.scenes import furry_post, wavy_post
 from torchdof import Camera, blur_by_coc
 from torchdof.export import describe
 from torchdof.export.verification import TOLERANCE, local_range, session
@@ -89,14 +90,18 @@ def test_a_file_without_edges_to_repair_is_bit_exact_in_focus(
     assert np.array_equal(got, image.numpy())
 
 
-def test_a_file_blurs_the_hair_that_the_map_misses(
-    runner: onnxruntime.InferenceSession, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("scene", "rule"), [(furry_post, "missed_parts"), (wavy_post, "in_doubt")])
+def test_a_file_blurs_what_the_map_misses_and_edges_in_doubt(
+    scene: Callable[[], tuple[Tensor, Tensor, Tensor]],
+    rule: str,
+    runner: onnxruntime.InferenceSession,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
-    image, coc, _ = furry_post()
+    image, coc, _ = scene()
     image = image[:, :1].contiguous()
     expected = rendered(image, coc, "auto")
-    with without(["missed_parts"]):
+    with without([rule]):
         assert float((expected - rendered(image, coc, "auto")).abs().max()) > 0.1
     got = runner.run(None, {"image": image.numpy(), "coc_px": coc.numpy()})[0]
     assert error(got, expected, image) <= TOLERANCE

@@ -15,7 +15,7 @@ from torchdof.render.rules import RULES, without
 
 SCENES = {scene.name: scene for scene in read_scenes(Path(__file__).parents[1] / "data" / "scenes")}
 # what each rule needs to be seen; all others are seen on depth of half the size
-ON_LAMPS_BEHIND_HAIR = ("emitters", "own_emitters", "rays", "occluders", "whole_highlights", "third_surfaces")
+ON_LAMPS_BEHIND_HAIR = ("emitters", "own_emitters", "rays", "occluders", "whole_highlights")
 
 
 def scene_for(rule: str) -> tuple[Tensor, Tensor]:
@@ -46,10 +46,12 @@ def scene_for(rule: str) -> tuple[Tensor, Tensor]:
         name = "portrait/0"
     elif rule == "soft_lamps":
         name, kind = "highlights/0", "blur 1.5"
+    elif rule == "third_surfaces":
+        kind = "quarter-res"
     scene = SCENES[name]
     depth = scene.depth if rule == "whole_highlights" else degrade(scene.depth, kind)
     coc_px = scene.camera.coc_px(depth, scene.image.shape[-1])
-    side = None if rule in ("soft_lamps", "few_samples") else 96
+    side = None if rule in ("soft_lamps", "few_samples", "third_surfaces") else 96
     return scene.image[..., :side, :side], coc_px[..., :side, :side]
 
 

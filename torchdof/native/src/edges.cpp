@@ -313,9 +313,9 @@ class Repair {
       choose_edges(groups, [&](const Edge &edge) { return doubtful[given_kind_of(edge)]; });
     judge(groups, true);
     decide(groups);
-    const float lost_px = move(groups, is_soft);
-    if (is_soft) remove_ringing();
     const float doubt = map_.automatic && is_soft ? doubt_of(agreement) : 0.0f;
+    const float lost_px = move(groups, is_soft, doubt);
+    if (is_soft) remove_ringing();
     if (is_soft && doubt < 1) lift_lamps(blur(), lost_px, doubt);
     if (map_.is_coc && doubt > 0) blur_in_doubt(doubt);
     return true;
@@ -1164,9 +1164,9 @@ class Repair {
     return std::clamp((float)std::sqrt(std::max(width * width - PIXEL, 0.0)), LEAST_BLUR_PX, MOST_BLUR_PX);
   }
 
-  // Decides which surface pixels show, and moves them to its nearness; on ramps in proportion to the evidence. Returns
-  // the width, in pixels, by which the map's near surfaces are too thin.
-  float move(const std::vector<Group> &groups, bool is_soft) const {
+  // Decides which surface pixels show, and moves them to its nearness; on ramps in proportion to the evidence, or to
+  // the doubt. Returns the width, in pixels, by which the map's near surfaces are too thin.
+  float move(const std::vector<Group> &groups, bool is_soft, float doubt) const {
     const float lean = map_.automatic ? LEAN : 0.0f, to_blurred = map_.automatic && map_.is_coc ? TO_BLURRED : 0.0f;
     float prior[KINDS];
     for (int k = 0; k < KINDS; k++) prior[k] = std::log(shares_[k] / (1.0f - shares_[k]));
@@ -1197,7 +1197,7 @@ class Repair {
         const uint8_t marks = marks_[edge.i];
         const bool was_near = marks & NEAR;
         lost[g] += shows_near - was_near;
-        const float moved = !(marks & RAMP) ? (float)(shows_near != was_near) : evidence_[edge.i];
+        const float moved = !(marks & RAMP) ? (float)(shows_near != was_near) : std::max(evidence_[edge.i], doubt);
         if (!(moved > 0)) continue;
         const float own = nearness(edge.i), surface = shows_near ? judged.near : judged.far;
         map_.out[edge.i] = sign_ * (own + moved * (surface - own));

@@ -366,11 +366,14 @@ def _repair(
     is_ramp = pixels.pick(edges.is_ramp, edge_pixels)[0]
     if not rules.third_surfaces:
         evidence = torch.ones_like(evidence)
+    doubt = given.new_zeros(batch, 1, 1, 1)
+    if auto and rules.in_doubt:
+        doubt = torch.where(is_soft, doubt_of(clear, agreed), doubt)
+    evidence = torch.maximum(evidence, doubt.flatten().index_select(0, edge_pixels // (height * width)))
     moved = torch.where(is_ramp, evidence, (shows_near != pixels.pick(is_near, edge_pixels)[0]).to(given.dtype))
     out = pixels.put(given, edge_pixels, torch.lerp(own, torch.where(shows_near, near, far), moved))
     if rules.ringing:
         out = torch.where(is_soft, _without_ringing(out, valid, step), out)
-    doubt = torch.where(is_soft, doubt_of(clear, agreed), 0.0) if auto and rules.in_doubt else torch.zeros_like(sigma)
     if rules.soft_lamps:
         out = _lift_lamps(light, given, out, step, is_soft, sigma, lost_px, doubt, ops)
     if auto and of_coc and rules.in_doubt:
