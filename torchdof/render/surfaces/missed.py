@@ -76,6 +76,8 @@ def completed(image: Tensor, coc_px: Tensor, before: Tensor, ops: Ops = EAGER) -
     light = image.detach().float()
     repaired, before = (t.detach().float().expand(image.shape[0], -1, -1, -1) for t in (coc_px, before))
     is_inexact = ((repaired - before).abs() > 0).flatten(1).any(1)
+    if not is_traced() and not is_inexact.any():
+        return coc_px
     if is_compiled():
         near_px = _operator(light, repaired, is_inexact)
     elif not is_traced() and all(map(is_in_memory, (image, coc_px))) and native.chosen():
@@ -103,6 +105,8 @@ def _completed(image: Tensor, coc_px: Tensor, is_inexact: Tensor, ops: Ops) -> T
         near, ring = torch.where(is_new, around, near), torch.where(is_new, float(k), ring)
         values = near
     has_edges = ring.any()
+    if not is_traced() and not has_edges:
+        return coc_px
 
     light = torch.where(torch.isfinite(image), image, 0.0).clamp(0.0, _BRIGHTEST).sqrt()
     is_sampled = (torch.arange(coc.shape[-2], device=coc.device) % _SAMPLED == 0)[:, None]
