@@ -1,9 +1,9 @@
 """Blurs the edges of depth maps that the image contradicts.
 
 Estimated depth often has its edges some pixels beside those of the image, on either side. Decisions pixel by pixel then
-leave sharp scraps beside blurred foregrounds, and rough rims on what is in focus. How many of the clearest pixels have
-the colour of the surface across the edge tells how far a map can be trusted. In doubt, what lies beside a blurred
-foreground is blurred too, less with every pixel of distance, and everything at an edge is a little blurred.
+leave sharp scraps beside blurred foregrounds, and rough rims on surfaces in focus. The share of the clearest pixels
+that have the colour of the surface across the edge measures this doubt. In doubt, a blurred foreground blurs its
+surroundings too, less with every pixel of distance, and everything at an edge is a little blurred.
 """
 
 import torch
@@ -22,7 +22,7 @@ _OF_NEAR = 0.5  # blur beside it in full doubt, over its own; larger: the same
 _LEAST_BLUR_PX = 1.5  # px; least blur at an edge in full doubt
 _AT_EDGE_PX = 2  # px; half the width of the window in which this blur fades
 _EDGE_REACH = 3  # px; distance at which surfaces on both sides of an edge are found
-_LEAST_STEP_PX = 3.0  # px; smallest difference in coc at such an edge
+_LEAST_STEP_PX = 3.0  # px; smallest difference in coc of the two surfaces of an edge
 _SHARPER = 0.7  # largest blur of a pixel beyond an edge, over that of the near surface; larger: edges within slopes
 _APART_PX = 2.0  # px; subtracted from it; larger: fewer edges
 _NEVER = -1e9  # nearness of invalid pixels
