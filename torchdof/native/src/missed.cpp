@@ -24,7 +24,7 @@ constexpr int SAMPLED = constants::missed::SAMPLED;
 constexpr int CELL = constants::missed::CELL;
 constexpr int NEARBY = constants::missed::NEARBY;
 constexpr int GROWTH_STEP_PX = constants::missed::GROWTH_STEP_PX;
-constexpr float GROWTH_PX = constants::missed::GROWTH_PX;
+constexpr int GROWTH_PX = constants::missed::GROWTH_PX;
 constexpr float GROWTH_OVER_SMOOTH_PX = constants::missed::GROWTH_OVER_SMOOTH_PX;
 constexpr float GRAIN = constants::missed::GRAIN;
 constexpr float SMOOTH = constants::missed::SMOOTH;
@@ -224,10 +224,12 @@ class Missed {
     });
   }
 
-  // Means around cells, of sums of background(): weight; light, its square; coc, its square; 0. The squares become one
-  // over the variance of light, and the standard deviation of coc. The last plane becomes 1 where the light is smooth.
+  // Means around cells, of sums of background(): weight; light, its square; coc, its square. The squares become one
+  // over the variance of light, and the standard deviation of coc. One more plane is 1 where the light is smooth, else
+  // 0.
   std::vector<float> described(std::vector<float> planes) const {
     average(planes, NEARBY);
+    planes.resize(planes.size() + cells_);
     parallel(map_.threads, rows_, map_.cancelled, [&](int y, int) {
       float *const seen = &planes[(size_t)y * columns_], *const light = seen + cells_;
       float *const square = light + channels_ * cells_, *const coc = square + cells_, *const coc_square = coc + cells_;
@@ -277,10 +279,10 @@ class Missed {
       }
   }
 
-  // Step 2: sums of the samples of each cell: their weight, light, its square, coc and its square; the last plane is 0.
-  // With the means of a first pass, samples far from them get less weight.
+  // Step 2: sums of the samples of each cell: their weight, light, its square, coc and its square. With the means of a
+  // first pass, samples far from them get less weight.
   std::vector<float> background(const std::vector<float> &means) {
-    const int planes = channels_ + 5;
+    const int planes = channels_ + 4;
     const bool is_second = !means.empty();
     std::vector<float> sums(planes * cells_);
     each_tile([&](int tile) {
@@ -398,7 +400,7 @@ class Missed {
     if (wanted.empty()) return false;
     memcpy(map_.out, map_.nearness, area_ * sizeof(float));
     bool changed = false;
-    for (int grown = 0; grown < (int)GROWTH_PX && !wanted.empty(); grown += GROWTH_STEP_PX) {
+    for (int grown = 0; grown < GROWTH_PX && !wanted.empty(); grown += GROWTH_STEP_PX) {
       taken.clear();
       for (const auto &[y, x] : wanted) {
         float &may = ring_[(size_t)y * pitch_ + x];

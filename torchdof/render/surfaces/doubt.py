@@ -11,7 +11,7 @@ from torch import Tensor
 
 from .windows import highest, mean_around
 
-__all__ = ["blurred_in_doubt", "is_beyond"]
+__all__ = ["blurred_in_doubt", "doubt_of", "is_beyond"]
 
 _CONTRADICTED = 0.03  # share of clear pixels that contradict the map, on either side, from which it is in doubt
 _OFTEN_CONTRADICTED = 0.045  # the same from which it is fully in doubt

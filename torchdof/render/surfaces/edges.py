@@ -376,10 +376,8 @@ def _repair(
         out = torch.where(is_soft, _without_ringing(out, valid, step), out)
     if rules.soft_lamps:
         out = _lift_lamps(light, given, out, step, is_soft, sigma, lost_px, doubt, ops)
-    if auto and of_coc and rules.in_doubt:
-        if is_traced() or (doubt > 0).any():
-            blurred = blurred_in_doubt(given, out, valid, doubt)
-            out = ops.equal_unless(lambda: (doubt > 0).any(), blurred, out)
+    if auto and of_coc and rules.in_doubt and (is_traced() or (doubt > 0).any()):
+        out = ops.equal_unless(lambda: (doubt > 0).any(), blurred_in_doubt(given, out, valid, doubt), out)
     out = torch.where(valid, out, nearness)
     return -out if of_coc else out
 

@@ -38,7 +38,7 @@ _MOST_UNLIKE = 1e3  # largest deviation that is compared with `_UNLIKE`, whose s
 _MISSED = 0.08  # share of unlike pixels, above that of the background, from which the map has missed parts
 _MANY_MISSED = 0.15  # the same from which near surfaces grow by `_GROWTH_PX`
 _COUNTED = 300.0  # compared pixels of a frame at which the share counts by half; larger: small edges count less
-_GROWTH_PX = 22.0  # px; by which near surfaces grow at most; larger: longer hairs
+_GROWTH_PX = 22  # px; by which near surfaces grow at most; larger: longer hairs
 _GROWTH_OVER_SMOOTH_PX = 10.0  # px; by which they grow over a smooth background
 _GROWTH_STEP_PX = 2  # px; they grow in steps, each onto pixels that are much less blurred
 _ON_SURFACE = 0.25  # deviation of the coc of samples, over the difference of both surfaces, up to which they are one
@@ -128,7 +128,7 @@ def _completed(image: Tensor, coc_px: Tensor, is_inexact: Tensor, ops: Ops) -> T
     if not is_traced() and not (growth > 0).any():
         return coc_px
 
-    for grown in range(0, int(_GROWTH_PX), _GROWTH_STEP_PX):
+    for grown in range(0, _GROWTH_PX, _GROWTH_STEP_PX):
         around = highest(surface, _GROWTH_STEP_PX)
         is_taken = (growth > grown) & is_beyond(blur, around)
         surface, growth = torch.where(is_taken, around, surface), torch.where(is_taken, 0.0, growth)
