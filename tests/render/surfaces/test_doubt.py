@@ -90,12 +90,12 @@ def test_engines_agree(size: tuple[int, int]) -> None:
     assert_close(fast, plain[0, 0], rtol=0, atol=1e-3)
 
 
-def test_full_doubt_blurs_beside_a_foreground_by_half_its_blur_and_fades() -> None:
+def test_full_doubt_blurs_beside_a_foreground_less_than_it_and_fades() -> None:
     given = torch.full((1, 1, 9, 40), -0.1)
     repaired = given.clone()
     repaired[..., :20] = 10.0
     blurred = blurred_in_doubt(given, repaired, torch.ones_like(given) > 0, torch.ones(1, 1, 1, 1))[0, 0, 4]
     assert_close(blurred[:20], repaired[0, 0, 4, :20])
-    expected = torch.tensor([2 * k / 11 * 5.0 for k in (5, 4, 3, 2, 1)])  # k of 11 columns are those of the foreground
-    assert_close(-blurred[20:25], expected)
-    assert_close(blurred[25:], given[0, 0, 4, 25:])
+    expected = torch.tensor([2 * k / 17 * 8.0 for k in range(8, 0, -1)])  # k of 17 columns are those of the foreground
+    assert_close(-blurred[20:28], expected)
+    assert_close(blurred[28:], given[0, 0, 4, 28:])

@@ -17,8 +17,8 @@ _CONTRADICTED = 0.03  # share of clear pixels that contradict the map, on either
 _OFTEN_CONTRADICTED = 0.045  # the same from which it is fully in doubt
 _ASSUMED = 15.0  # pixels that are assumed to agree with the map; larger: maps with few edges are trusted
 _MOVED_PX = 1.0  # px; change of the coc from which the repair of edges has moved a pixel
-_REACH = 5  # px; distance from a blurred foreground at which its blur has faded; larger: fewer scraps, softer pictures
-_OF_NEAR = 0.5  # blur beside it in full doubt, over its own; larger: the same
+_REACH = 8  # px; distance from a blurred foreground at which its blur has faded; larger: fewer scraps, softer pictures
+_OF_NEAR = 0.8  # blur beside it in full doubt, over its own; larger: the same
 _LEAST_BLUR_PX = 1.5  # px; least blur at an edge in full doubt
 _AT_EDGE_PX = 2  # px; half the width of the window in which this blur fades
 _EDGE_REACH = 3  # px; distance at which surfaces on both sides of an edge are found
@@ -51,8 +51,8 @@ def doubt_of(clear: Tensor, agreed: Tensor) -> Tensor:
 def blurred_in_doubt(given: Tensor, repaired: Tensor, valid: Tensor, doubt: Tensor) -> Tensor:
     """Raises the blur beside edges that the repair has moved.
 
-    1. Beside a near surface with blur r, the blur is at least ``doubt r / 2``. This fades with the share of the near
-       surface in the 11 x 11 pixels around, from a half to 0.
+    1. Beside a near surface with blur r, the blur is at least ``0.8 doubt r``. This fades with the share of the near
+       surface in the 17 x 17 pixels around, from a half to 0.
     2. At any edge, it is at least ``1.5 doubt`` pixels, which fades within a few pixels.
 
     Args:
