@@ -317,7 +317,7 @@ def upright(image: Tensor, depth: Tensor) -> None:
     if as_it_is is not None and turned is not None and turned <= _SAME_SHAPE < as_it_is:
         (height, width), (rows, columns) = image.shape[-2:], depth.shape[-2:]
         sizes = f"depth is {columns} x {rows} pixels and the image {width} x {height}"
-        raise ValueError(f"{sizes}: turned by 90 degrees it fits: rotate one")
+        raise ValueError(f"{sizes}: turned by 90 degrees it fits; it needs the orientation of the image: rotate one")
 
 
 def stretched(image: Tensor, depth: Tensor) -> str:

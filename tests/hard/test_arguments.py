@@ -149,6 +149,7 @@ def check_error(call: Callable[[], Any], *others: type[Exception]) -> None:
         assert re.search(r"got|there|valid|has|missing|is not|neither|must lie|one place|needs|; set ", message)
 
 
+@pytest.mark.filterwarnings("ignore:depth of .* px stretched")  # a map of another shape is taken, with a note
 @pytest.mark.parametrize("name", CALLS)
 @FEW
 @given(st.data())

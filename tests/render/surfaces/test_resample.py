@@ -82,5 +82,5 @@ def test_the_module_resamples_a_smaller_map_and_stretches_one_of_another_shape()
         out = dof(image, square)
     with pytest.warns(UserWarning, match="stretched"):
         assert torch.equal(out, dof(image, at_size_of(image, square)))
-    with pytest.raises(ValueError, match="turned by 90 degrees it fits"):
+    with pytest.raises(ValueError, match="turned by 90 degrees it fits; it needs the orientation of the image"):
         dof(image, small.mT)
