@@ -149,7 +149,10 @@ def check_error(call: Callable[[], Any], *others: type[Exception]) -> None:
         assert re.search(r"got|there|valid|has|missing|is not|neither|must lie|one place|needs|; set ", message)
 
 
-@pytest.mark.filterwarnings("ignore:depth of .* px stretched")  # a map of another shape is taken, with a note
+# A map of another shape is taken, with this note.
+@pytest.mark.filterwarnings(
+    "ignore:depth of .* px stretched by .* to the shape of the image; both must show the same area"
+)
 @pytest.mark.parametrize("name", CALLS)
 @FEW
 @given(st.data())

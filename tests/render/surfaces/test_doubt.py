@@ -90,7 +90,7 @@ def test_engines_agree(size: tuple[int, int]) -> None:
     assert_close(fast, plain[0, 0], rtol=0, atol=1e-3)
 
 
-def test_full_doubt_blurs_beside_a_foreground_less_than_it_and_fades() -> None:
+def test_full_doubt_blurs_beside_a_foreground_by_a_share_of_its_blur_that_fades() -> None:
     given = torch.full((1, 1, 9, 40), -0.1)
     repaired = given.clone()
     repaired[..., :20] = 10.0

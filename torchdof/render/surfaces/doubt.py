@@ -51,9 +51,9 @@ def doubt_of(clear: Tensor, agreed: Tensor) -> Tensor:
 def blurred_in_doubt(given: Tensor, repaired: Tensor, valid: Tensor, doubt: Tensor) -> Tensor:
     """Raises the blur beside edges that the repair has moved.
 
-    1. Beside a near surface with blur r, the blur is at least ``0.8 doubt r``. This fades with the share of the near
-       surface in the 17 x 17 pixels around, from a half to 0.
-    2. At any edge, it is at least ``1.5 doubt`` pixels, which fades within a few pixels.
+    1. Beside a near surface with blur r, the blur is at least ``_OF_NEAR doubt r``. This fades with the share of the
+       near surface among the pixels up to ``_REACH`` away, from a half to 0.
+    2. At any edge, it is at least ``_LEAST_BLUR_PX doubt``, which fades within a few pixels.
 
     Args:
         given: Negated coc in pixels before the repair, ``[B, 1, H, W]``.
