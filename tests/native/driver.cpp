@@ -277,8 +277,19 @@ void check_edges(unsigned seed) {
                               &never,
                               out.data()};
     int32_t changed = 0;
-    if (torchdof_repair_edges(&map, &changed) != TORCHDOF_OK) fail("its edges cannot be repaired", int(seed));
+    double doubt = 0.0;
+    if (torchdof_repair_edges(&map, &changed, &doubt) != TORCHDOF_OK) fail("its edges cannot be repaired", int(seed));
     if (!changed) out = nearness;
+    if (map.is_coc) {
+      const std::vector<float> repaired = out;
+      torchdof_map of_repaired = map;
+      of_repaired.nearness = repaired.data();
+      if (torchdof_missed_parts(&of_repaired, &changed, &doubt) != TORCHDOF_OK) fail("it cannot grow", int(seed));
+      if (!changed) out = repaired;
+      const std::vector<float> grown = out;
+      if (torchdof_blurred_in_doubt(nearness.data(), grown.data(), map.height, map.width, 0.7f, threads, out.data()))
+        fail("its edges cannot be blurred", int(seed));
+    }
     for (size_t i = 0; i < pixels; i++) {
       if (std::isfinite(nearness[i])) continue;
       if (std::memcmp(&out[i], &nearness[i], sizeof(float))) fail("a value that is not finite is changed", int(seed));

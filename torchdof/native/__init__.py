@@ -415,31 +415,41 @@ def continued_gradient(gradient: Tensor, maps: Sequence[Tensor], ends: Sequence[
     return sums
 
 
-def repair_edges(light: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool = False) -> Tensor:
+def repair_edges(
+    light: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool = False
+) -> tuple[Tensor, float]:
     """Repairs the edges of a depth map, as :func:`torchdof.render.surfaces.edges.repair`, for one image.
 
-    ``light`` is ``[C, H, W]``, ``nearness`` ``[H, W]``, ``step`` ``[H, W]`` or ``[]``. The result ``[H, W]`` is the
-    input itself if it needs no repair.
+    ``light`` is ``[C, H, W]``, ``nearness`` ``[H, W]``, ``step`` ``[H, W]`` or ``[]``. The results are the map, the
+    input itself if it needs no repair, and how much it is in doubt, 0 to 1.
     """
     steps = (None, float(step)) if step.ndim == 0 else (step, 0.0)
     return _changed("repair_edges", light, nearness, of_coc, *steps, auto)
 
 
-def missed_parts(light: Tensor, coc_px: Tensor) -> Tensor:
+def missed_parts(light: Tensor, coc_px: Tensor) -> tuple[Tensor, float]:
     """Completes a map of the coc, as :func:`torchdof.render.surfaces.missed.completed`, for one image.
 
-    ``light`` is ``[C, H, W]``, ``coc_px`` ``[H, W]``. The result ``[H, W]`` is the input itself if it stays unchanged.
+    ``light`` is ``[C, H, W]``, ``coc_px`` ``[H, W]``. The results are the map, the input itself if it stays unchanged,
+    and how far it has missed parts, 0 to 1.
     """
     return _changed("missed_parts", light, coc_px, True, None, 0.0, False)
 
 
-def _changed(function: str, light: Tensor, map_: Tensor, *options: Any) -> Tensor:
-    """What a function of ``api.h`` makes of a map, or the map itself if it stays unchanged."""
-    out, cancelled, changed = _empty(*map_.shape), ctypes.c_int32(0), ctypes.c_int32(0)
+def blurred_in_doubt(given: Tensor, repaired: Tensor, doubt: float) -> Tensor:
+    """Blurs the edges of a map of the coc ``[H, W]``, as :func:`torchdof.render.surfaces.doubt.blurred_in_doubt`."""
+    out = _empty(*repaired.shape)
+    _run("blurred_in_doubt", given, repaired, *repaired.shape, doubt, _threads(), out)
+    return out
+
+
+def _changed(function: str, light: Tensor, map_: Tensor, *options: Any) -> tuple[Tensor, float]:
+    """What a function of ``api.h`` makes of a map, or the map itself if it stays unchanged; and a number."""
+    out, cancelled, changed, number = _empty(*map_.shape), ctypes.c_int32(0), ctypes.c_int32(0), ctypes.c_double(0.0)
     maps = (*map_.shape, light.shape[0], light, map_, *options)
     scene = _API.structures["map"](*maps, _threads(), ctypes.pointer(cancelled), out)
-    _interruptible(lambda: _run(function, scene, changed), cancelled, map_.numel())
-    return out if changed.value else map_
+    _interruptible(lambda: _run(function, scene, changed, number), cancelled, map_.numel())
+    return out if changed.value else map_, number.value
 
 
 def coc_px(depth: Tensor, scale: float, nearest_m: float, farthest_m: float) -> Tensor:

@@ -124,11 +124,16 @@ typedef struct {
   float *out;  // [height, width]
 } torchdof_map;
 
-// changed: 0 if the map needs no repair; out is then not written.
-TORCHDOF_API int32_t torchdof_repair_edges(const torchdof_map *map, int32_t *changed);
+// changed: 0 if the map needs no repair; out is then not written. doubt: how much the map is in doubt, 0 to 1.
+TORCHDOF_API int32_t torchdof_repair_edges(const torchdof_map *map, int32_t *changed, double *doubt);
 
 // Gives missed fine parts of blurred foregrounds to them, in a map of coc; reads neither steps nor `automatic`.
-TORCHDOF_API int32_t torchdof_missed_parts(const torchdof_map *map, int32_t *changed);
+// share: how far the map has missed parts, 0 to 1.
+TORCHDOF_API int32_t torchdof_missed_parts(const torchdof_map *map, int32_t *changed, double *share);
+
+// Blurs the edges of a map of coc [height, width] that is in doubt, from the map before its repair and after it.
+TORCHDOF_API int32_t torchdof_blurred_in_doubt(const float *given, const float *repaired, int32_t height, int32_t width,
+                                               float doubt, int32_t threads, float *out);
 
 // A padded frame whose layers are blurred and composited: surfaces of each pixel, all of them with a margin.
 typedef struct {

@@ -188,11 +188,11 @@ def test_items_of_a_batch_are_repaired_independently(scene: Scene) -> None:
 def test_noise_is_not_an_edge_and_edges_in_noise_are_repaired(scene: Scene, engine: str) -> None:
     for shape in ((1, 1, 128, 1), (1, 1, 1, 192)):  # along rows and along columns
         noise = (2.0 * torch.randn(shape, generator=torch.Generator().manual_seed(0))).expand(scene.depth.shape)
-        assert torch.equal(edges.repair(scene.image, noise.contiguous(), edges.STEP_PX, False), noise)
+        assert torch.equal(edges.repair(scene.image, noise.contiguous(), edges.STEP_PX, False)[0], noise)
     exact, thin = (-8.0 * scene.camera.coc_px(degrade(scene.depth, kind), 192) for kind in ("exact", "near -1px"))
     noise = 0.3 * torch.randn(exact.shape)  # its range within five pixels is as large as a step
-    assert torch.equal(edges.repair(scene.image, exact + noise, 1.0, True), exact + noise)
-    left = (edges.repair(scene.image, thin + noise, 1.0, True) - exact).abs() > 10.0
+    assert torch.equal(edges.repair(scene.image, exact + noise, 1.0, True)[0], exact + noise)
+    left = (edges.repair(scene.image, thin + noise, 1.0, True)[0] - exact).abs() > 10.0
     assert float(left.float().mean()) < 0.25 * float(((thin - exact).abs() > 10.0).float().mean())
 
 
@@ -202,7 +202,7 @@ def test_a_slope_is_unchanged(steepness: float, how: DepthEdges) -> None:
     x, y = torch.meshgrid(torch.arange(96.0), torch.arange(64.0), indexing="xy")
     coc = (steepness * (x + 0.3 * y))[None, None]
     image = waves(5)(x.double(), y.double()).float()[None]
-    assert torch.equal(-edges.repair(image, -coc, torch.tensor(1.0), how == "auto"), coc)
+    assert torch.equal(-edges.repair(image, -coc, torch.tensor(1.0), how == "auto")[0], coc)
 
 
 def test_a_thin_structure_of_a_soft_map_comes_no_nearer_than_the_map(scene: Scene) -> None:
@@ -255,9 +255,9 @@ def test_repair_commutes_with_flips_and_turns(
     height, width = exact.shape[-2:]
     coc = torch.where(torch.arange(width) + torch.arange(height)[:, None] < 0.9 * width, damaged, exact)
     coc = coc + 0.01 * torch.randn(height, 1, generator=torch.Generator().manual_seed(0))
-    repaired = edges.repair(image, -coc, edges.STEP_PX, True)
+    repaired = edges.repair(image, -coc, edges.STEP_PX, True)[0]
     assert not torch.equal(repaired, -coc)
-    turned = edges.repair(turn(image).contiguous(), turn(-coc).contiguous(), edges.STEP_PX, True)
+    turned = edges.repair(turn(image).contiguous(), turn(-coc).contiguous(), edges.STEP_PX, True)[0]
     torch.testing.assert_close(turned, turn(repaired), rtol=0, atol=1e-3)
 
 
@@ -285,8 +285,8 @@ def test_differences_below_half_a_step_are_not_edges(scene: Scene, kind: str, en
     image[..., 60:62, 90:92] = 500.0
     nearness[..., 60:62, 90:92] = nearness.max()
     low, high = nearness.aminmax()
-    assert not torch.equal(edges.repair(image, nearness, 0.5 * float(high - low), False), nearness)
-    assert torch.equal(edges.repair(image, nearness, 2.001 * float(high - low), False), nearness)
+    assert not torch.equal(edges.repair(image, nearness, 0.5 * float(high - low), False)[0], nearness)
+    assert torch.equal(edges.repair(image, nearness, 2.001 * float(high - low), False)[0], nearness)
 
 
 @pytest.mark.parametrize("moved", [1e-4, -1e-4])
@@ -315,7 +315,7 @@ def test_gradients_flow_to_pixels_that_are_not_repaired(scene: Scene) -> None:
 def test_the_renderer_repairs_by_its_option_depth_edges(scene: Scene) -> None:
     depth = degrade(scene.depth, "half-res")
     coc = scene.camera.coc_px(depth, 192)
-    repaired = edges.repair(scene.image, coc, torch.tensor(1.0), True, of_coc=True)
+    repaired = edges.repair(scene.image, coc, torch.tensor(1.0), True, of_coc=True)[0]
     as_given = DepthOfField(scene.camera, depth_edges="as given")
     assert torch.equal(as_given.coc_px(scene.image, depth), coc)
     assert torch.equal(DepthOfField(scene.camera).coc_px(scene.image, depth), repaired)
@@ -328,8 +328,8 @@ def test_the_renderer_repairs_by_its_option_depth_edges(scene: Scene) -> None:
 
 def assert_engines_agree(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> None:
     for given, of_coc in ((nearness, False), (-nearness, True)):
-        plain = edges._repair(image, given, step, auto, of_coc)[0, 0]
-        fast = native.repair_edges(image[0], given[0, 0], step.squeeze(), auto, of_coc=of_coc)
+        plain = edges._repair(image, given, step, auto, of_coc)[0][0, 0]
+        fast = native.repair_edges(image[0], given[0, 0], step.squeeze(), auto, of_coc=of_coc)[0]
         same = torch.isclose(fast, plain, rtol=1e-3, atol=1e-3, equal_nan=True)
         assert float(same.float().mean()) > 0.999  # rounding may decide if both surfaces are equally likely
         unchanged = [torch.allclose(n, given[0, 0], rtol=0, atol=0, equal_nan=True) for n in (plain, fast)]
@@ -360,15 +360,15 @@ def test_any_number_of_threads_gives_the_same_bits(scene: Scene) -> None:
     threads, results = torch.get_num_threads(), []
     for count in (1, 2, 5, threads):
         torch.set_num_threads(count)
-        results.append(native.repair_edges(scene.image[0], nearness, torch.tensor(1.0), True))
+        results.append(native.repair_edges(scene.image[0], nearness, torch.tensor(1.0), True)[0])
     assert all(torch.equal(result, results[0]) for result in results)
 
 
 def test_repair_compiles_without_graph_breaks(scene: Scene) -> None:
     coc = scene.camera.coc_px(degrade(scene.depth, "half-res"), 192)
     compiled = torch.compile(edges.repair, backend="eager", fullgraph=True)
-    plain = edges._repair(scene.image, -coc, torch.tensor(1.0), True)
-    torch.testing.assert_close(compiled(scene.image, -coc, 1.0, True), plain)
+    plain = edges._repair(scene.image, -coc, torch.tensor(1.0), True)[0]
+    torch.testing.assert_close(compiled(scene.image, -coc, 1.0, True)[0], plain)
 
 
 @pytest.mark.parametrize("auto", [True, False])
@@ -382,7 +382,7 @@ def test_repairs_of_all_maps_are_finite(near: float, far: float, light: float, e
     nearness[..., 6:18, 9:21] = near  # one pixel right of the image's square
     image = torch.full((1, 3, 24, 32), 0.1 * light)
     image[..., 6:18, 8:20] = light
-    repaired = edges.repair(image, nearness, torch.tensor(1.0), auto)
+    repaired = edges.repair(image, nearness, torch.tensor(1.0), auto)[0]
     known = torch.isfinite(nearness)
     assert torch.equal(torch.isfinite(repaired), known)
     assert float(repaired[known].abs().max()) <= 1.001 * float(nearness[known].abs().max())

@@ -1,7 +1,6 @@
 // Repairs the edges of a depth map: the compiled version of torchdof/render/surfaces/edges.py, with the same constants.
 //
-// The frame is processed in tiles of AREA x AREA pixels, and within a tile only where the map changes. Each tile is
-// copied with a margin, padded beyond the frame with the nearest border pixel, so that loops run in whole vectors.
+// The frame is processed in tiles of AREA x AREA pixels, and within a tile only where the map changes.
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -14,6 +13,7 @@
 #include "constants/doubt.h"
 #include "constants/edges.h"
 #include "entry.h"
+#include "grid.h"
 #include "memory.h"
 #include "rules.h"
 #include "simd.h"
@@ -88,13 +88,6 @@ constexpr int KINDS = DIRECTIONS * PLACES;
 constexpr float CONTRADICTED = constants::doubt::CONTRADICTED;
 constexpr float OFTEN_CONTRADICTED = constants::doubt::OFTEN_CONTRADICTED;
 constexpr float ASSUMED = constants::doubt::ASSUMED;
-constexpr float MOVED_PX = constants::doubt::MOVED_PX;
-constexpr int REACH_IN_DOUBT = constants::doubt::REACH;
-constexpr float OF_NEAR = constants::doubt::OF_NEAR;
-constexpr float BLUR_IN_DOUBT_PX = constants::doubt::LEAST_BLUR_PX;
-constexpr int AT_EDGE_PX = constants::doubt::AT_EDGE_PX;
-constexpr int EDGE_REACH = constants::doubt::EDGE_REACH;
-constexpr float LEAST_STEP_PX = constants::doubt::LEAST_STEP_PX;
 
 constexpr int AREA = 96;  // side of a tile in pixels
 // A pixel's result depends on the pixels within this many of it: without ramps, and with ramps.
@@ -114,40 +107,11 @@ using constants::edges::SURE;
 constexpr float SURE_OF[256 / UNSURE] = {(float)SURE[4], (float)SURE[3], (float)SURE[2], (float)SURE[1],
                                          (float)SURE[0]};
 
-// A rectangle in the coordinates of the frame; may reach beyond the frame.
-struct Part {
-  int y0, x0, height, width;
-
-  int bottom() const { return y0 + height; }
-  int right() const { return x0 + width; }
-  bool has(int y, int x) const { return y >= y0 && y < bottom() && x >= x0 && x < right(); }
-  Part grown(int by) const { return {y0 - by, x0 - by, height + 2 * by, width + 2 * by}; }
-};
-
 // A pixel whose surface is to be decided.
 struct Edge {
   int i;
   float near, far;  // of the two surfaces that meet there
   uint8_t kind;
-};
-
-// A temporary plane, or several, addressed by frame coordinates. Rows are padded by up to two vectors that may be read.
-class Grid : public Part {
- public:
-  explicit Grid(const Part &part, int planes = 1)
-      : Part(part), pitch((part.width + LANES - 1) / LANES * LANES + 2 * LANES), size((size_t)part.height * pitch),
-        data_(size * planes + LANES) {
-    std::fill(&data_[size * planes], &data_[size * planes] + LANES, 0.0f);
-  }
-
-  float *at(int y, int x) const { return data_.data() + (size_t)(y - y0) * pitch + (x - x0); }
-  void clear() const { std::fill(data_.data(), data_.data() + size, 0.0f); }
-
-  const int pitch;
-  const size_t size;  // values in a plane
-
- private:
-  const Buffer<float> data_;
 };
 
 // Calls look(n, take) for each vector n of a window; take(p, pitch) loads it from a grid, p being the window's first
@@ -179,57 +143,6 @@ std::vector<float> window(const Of &of) {
       values[u < WHOLE ? v * WHOLE + u : SIDE * WHOLE + 4 * v + u - WHOLE] =
           of((float)((v - REACH) * (v - REACH) + (u - REACH) * (u - REACH)));
   return values;
-}
-
-// Calls body(y, x) for each vector of a part; the last vector of a row may extend beyond the part.
-template <typename Body>
-inline void each_vector(const Part &part, const Body &body) {
-  for (int y = part.y0; y < part.bottom(); y++)
-    for (int x = part.x0; x < part.right(); x += LANES) body(y, x);
-}
-
-// Maximum over a square of side 2 REACH_ + 1 around each value of a part: the maximum of three overlapping runs.
-template <int REACH_>
-void max_filter(const Grid &in, const Grid &out, const Grid &rows, const Part &part) {
-  constexpr int TAPS = 2 * REACH_ + 1, RUN = (TAPS + 2) / 3, LAST = TAPS - RUN, MIDDLE = LAST / 2;
-  const auto run = [](const float *from, int stride) {
-    vec high = load<vec>(from);
-    for (int d = 1; d < RUN; d++) high = max(high, load<vec>(from + d * stride));
-    return high;
-  };
-  const auto three = [](const float *from, int stride) {
-    return max(load<vec>(from), max(load<vec>(from + MIDDLE * stride), load<vec>(from + LAST * stride)));
-  };
-  for (int y = part.y0 - REACH_; y < part.bottom() + REACH_; y++) {
-    for (int x = part.x0; RUN > 1 && x < part.right() + LAST; x += LANES)
-      store(rows.at(y, x), run(in.at(y, x - REACH_), 1));
-    for (int x = part.x0; x < part.right(); x += LANES)
-      store(rows.at(y, x), three(RUN > 1 ? rows.at(y, x) : in.at(y, x - REACH_), 1));
-  }
-  each_vector({part.y0 - REACH_, part.x0, RUN > 1 ? part.height + LAST : 0, part.width},
-              [&](int y, int x) { store(rows.at(y, x), run(rows.at(y, x), rows.pitch)); });
-  each_vector(part, [&](int y, int x) { store(out.at(y, x), three(rows.at(y - REACH_, x), rows.pitch)); });
-}
-
-// Maximum over 3 x 3 values around each value of a vector.
-inline vec max_3x3(const float *from, int pitch) {
-  vec high = max(load<vec>(from), max(load<vec>(from - 1), load<vec>(from + 1)));
-  for (const float *row : {from - pitch, from + pitch})
-    high = max(high, max(load<vec>(row), max(load<vec>(row - 1), load<vec>(row + 1))));
-  return high;
-}
-
-// Sum over a square of side 2 REACH_ + 1 around each value of a part, times a factor.
-template <int REACH_>
-void sums(const Grid &in, const Grid &out, const Grid &rows, const Part &part, float factor) {
-  const auto sum = [](const float *middle, int stride) {
-    vec total = load<vec>(middle);
-    for (int d = 1; d <= REACH_; d++) total += load<vec>(middle - d * stride) + load<vec>(middle + d * stride);
-    return total;
-  };
-  each_vector({part.y0 - REACH_, part.x0, part.height + 2 * REACH_, part.width},
-              [&](int y, int x) { store(rows.at(y, x), sum(in.at(y, x), 1)); });
-  each_vector(part, [&](int y, int x) { store(out.at(y, x), sum(rows.at(y, x), rows.pitch) * factor); });
 }
 
 // Which surface a pixel shows. score: log-odds of the near surface. reliability: 0 to 1, how well colours separate the
@@ -267,11 +180,11 @@ struct Agreement {
   double clear[2] = {}, agreed[2] = {};
 };
 
-class Repair {
+class Repair : Frame {
  public:
   explicit Repair(const torchdof_map &map)
-      : map_(map), sign_(map.is_coc ? -1.0f : 1.0f), height_(map.height), width_(map.width), channels_(map.channels),
-        area_((size_t)map.height * map.width), score_(area_), evidence_(area_), marks_(area_) {}
+      : Frame(map.height, map.width), map_(map), sign_(map.is_coc ? -1.0f : 1.0f), channels_(map.channels),
+        score_(area_), evidence_(area_), marks_(area_) {}
 
   // 1. Find the edges of a sample of the frame, see whether the map is soft, and decide by colour which surface each
   //    pixel shows.
@@ -279,8 +192,9 @@ class Repair {
   // 3. In automatic mode stop here if the map is exact or its edges are unrelated to the image's.
   // 4. Find and decide the edges of the whole frame; move pixels that have the depth of the wrong surface.
   // 5. In a soft map also remove ringing, and restore the nearness of small lamps that a blur has reduced.
-  // 6. Blur the edges of a soft map of the coc that the image contradicts.
-  bool run() {
+  // Returns whether the map has changed; doubt: how much the image contradicts a soft map, 0 to 1.
+  bool run(double &doubt) {
+    doubt = 0;
     noise_step_ = NOISES * noise();
     const int every = (int)std::ceil(std::sqrt((double)area_ / SAMPLED));
     const bool finds_twice =
@@ -313,11 +227,10 @@ class Repair {
       choose_edges(groups, [&](const Edge &edge) { return doubtful[given_kind_of(edge)]; });
     judge(groups, true);
     decide(groups);
-    const float doubt = map_.automatic && is_soft ? doubt_of(agreement) : 0.0f;
-    const float lost_px = move(groups, is_soft, doubt);
+    if (map_.automatic && is_soft) doubt = doubt_of(agreement);
+    const float lost_px = move(groups, is_soft, (float)doubt);
     if (is_soft) remove_ringing();
-    if (is_soft && doubt < 1) lift_lamps(blur(), lost_px, doubt);
-    if (map_.is_coc && doubt > 0) blur_in_doubt(doubt);
+    if (is_soft && doubt < 1) lift_lamps(blur(), lost_px, (float)doubt);
     return true;
   }
 
@@ -496,40 +409,6 @@ class Repair {
       right = std::max(right, x + 1);
     });
     return {top, left, bottom - top, right - left};
-  }
-
-  Part in_frame(const Part &part) const {
-    const int y0 = std::max(0, part.y0), x0 = std::max(0, part.x0);
-    return {y0, x0, std::min(height_, part.bottom()) - y0, std::min(width_, part.right()) - x0};
-  }
-
-  // Fills all rows of a grid from a plane of the frame, padding with the nearest border pixel.
-  template <typename Value, typename Of>
-  void fetch(const Value *plane, const Grid &grid, float *to, const Of &of) const {
-    const int first = std::max(0, -grid.x0), last = std::min(grid.pitch, width_ - grid.x0);
-    for (int y = grid.y0; y < grid.bottom(); y++, to += grid.pitch) {
-      const Value *from = plane + (ptrdiff_t)std::min(std::max(y, 0), height_ - 1) * width_ + grid.x0;
-      for (int x = first; x < last; x++) to[x] = of(from[x]);
-      std::fill(to, to + first, to[first]);
-      std::fill(to + last, to + grid.pitch, to[last - 1]);
-    }
-  }
-  template <typename Value, typename Of>
-  void fetch(const Value *plane, const Grid &grid, const Of &of) const {
-    fetch(plane, grid, grid.at(grid.y0, grid.x0), of);
-  }
-
-  // Overwrites values of a part beyond the frame with the nearest value inside.
-  void clamp_to_frame(const Grid &grid, const Part &part) const {
-    const Part inside = in_frame(part);
-    for (int y = inside.y0; y < inside.bottom(); y++) {
-      float *row = grid.at(y, 0);
-      std::fill(row + part.x0, row + inside.x0, row[inside.x0]);
-      if (inside.right() < part.right()) std::fill(row + inside.right(), row + part.right(), row[inside.right() - 1]);
-    }
-    for (int y = part.y0; y < part.bottom(); y++)
-      if (const int nearest = std::min(std::max(y, inside.y0), inside.bottom() - 1); nearest != y)
-        memcpy(grid.at(y, part.x0), grid.at(nearest, part.x0), part.width * sizeof(float));
   }
 
   // Finds steps and ramps and their two surfaces: returns the groups' edges, and marks pixels up to `halo` around them.
@@ -1365,62 +1244,6 @@ class Repair {
     });
   }
 
-  // render/surfaces/doubt.py, blurred_in_doubt.
-  void blur_in_doubt(float doubt) {
-    memcpy(evidence_.data(), map_.out, area_ * sizeof(float));
-    const std::vector<Group> parts = tiles();
-    parallel((int)parts.size(), [&](int g) {
-      const Part &part = parts[g].part, beside = part.grown(REACH_IN_DOUBT), whole = beside.grown(REACH_IN_DOUBT);
-      const Grid now(whole), moved(whole), rows(whole);
-      const auto value = [this](float v) { return std::fabs(v) <= LARGEST ? sign_ * v : -NONE; };
-      fetch(map_.nearness, moved, value);
-      fetch(evidence_.data(), now, value);
-      vec any{};
-      each_vector(whole, [&](int y, int x) {
-        const vec change = abs(load<vec>(now.at(y, x)) - load<vec>(moved.at(y, x)));
-        store(moved.at(y, x), change > MOVED_PX ? broadcast(1.0f) : vec{});
-        any = max(any, load<vec>(moved.at(y, x)));
-      });
-      if (!(reduce_max(any) > 0)) return;
-
-      const Grid near(beside), is_near(beside), share(part), is_beside(part);
-      max_filter<REACH_IN_DOUBT>(now, near, rows, beside);
-      each_vector(beside, [&](int y, int x) {
-        const vec half = 0.5f * max(load<vec>(near.at(y, x)), broadcast(1.0f));
-        store(is_near.at(y, x), load<vec>(now.at(y, x)) > half ? broadcast(1.0f) : vec{});
-      });
-      clamp_to_frame(is_near, beside);
-      sums<REACH_IN_DOUBT>(is_near, share, rows, part, one_over_square(REACH_IN_DOUBT));
-      max_filter<REACH_IN_DOUBT>(moved, is_beside, rows, part);
-
-      const Part at_edge = part.grown(AT_EDGE_PX), around = part.grown(EDGE_REACH);
-      const Grid down(around), high(part), low(part), edge(at_edge), fading(part);
-      each_vector(around, [&](int y, int x) {
-        const vec own = load<vec>(now.at(y, x));
-        store(down.at(y, x), own > -NONE ? -own : own);
-      });
-      max_filter<EDGE_REACH>(now, high, rows, part);
-      max_filter<EDGE_REACH>(down, low, rows, part);
-      each_vector(at_edge, [&](int y, int x) { store(edge.at(y, x), max_3x3(moved.at(y, x), moved.pitch)); });
-      clamp_to_frame(edge, at_edge);
-      sums<AT_EDGE_PX>(edge, fading, rows, part, one_over_square(AT_EDGE_PX));
-
-      for (int y = part.y0; y < part.bottom(); y++)
-        for (int x = part.x0; x < part.right(); x++) {
-          const float own = *now.at(y, x), nearest = *near.at(y, x);
-          float least = 0;
-          if (*is_beside.at(y, x) > 0 && is_beyond(std::fabs(own), nearest))
-            least = OF_NEAR * nearest * std::min(2.0f * *share.at(y, x), 1.0f);
-          if (*high.at(y, x) + *low.at(y, x) > LEAST_STEP_PX)
-            least = std::max(least, BLUR_IN_DOUBT_PX * *fading.at(y, x));
-          least *= doubt;
-          if (std::fabs(own) < least) map_.out[(size_t)y * width_ + x] = sign_ * (own > 0 ? least : -least);
-        }
-    });
-  }
-
-  static constexpr float one_over_square(int reach) { return 1.0f / (float)((2 * reach + 1) * (2 * reach + 1)); }
-
   // bright: the brightest channel of each pixel; usual: in a part, the square of the mean of its root around the pixel.
   void brightest(const Grid &bright, const Grid &usual, const Grid &rows, const Part &part) const {
     const Grid light{Part(bright)};
@@ -1498,8 +1321,7 @@ class Repair {
 
   const torchdof_map &map_;
   const float sign_;  // -1 for a map of coc, where larger is farther
-  const int height_, width_, channels_;
-  const size_t area_;
+  const int channels_;
   float noise_step_ = 0.0f;  // smallest step that is larger than the map's noise
   float sharpness_ = SHARPNESS;
   const Buffer<float> score_, evidence_;
@@ -1511,6 +1333,6 @@ class Repair {
 }  // namespace
 }  // namespace torchdof
 
-int32_t torchdof_repair_edges(const torchdof_map *map, int32_t *changed) {
-  return torchdof::guarded([&] { *changed = torchdof::Repair(*map).run(); });
+int32_t torchdof_repair_edges(const torchdof_map *map, int32_t *changed, double *doubt) {
+  return torchdof::guarded([&] { *changed = torchdof::Repair(*map).run(*doubt); });
 }

@@ -70,12 +70,14 @@ class Missed {
         rows_((height_ + CELL - 1) / CELL), columns_((width_ + CELL - 1) / CELL), cells_((size_t)rows_ * columns_),
         plane_((size_t)pitch_ * height_), ring_(plane_), near_(plane_), coc_(plane_), roots_(channels_ * plane_) {}
 
-  // Returns whether the map has changed; out is written only then.
-  bool run() {
+  // Returns whether the map has changed; out is written only then. share: how far the map has missed parts, 0 to 1.
+  bool run(double &share) {
+    share = 0;
     find_rings();
     if (tiles_.empty()) return false;
     const std::vector<float> means = described(background(described(background({}))));
-    return grow(means, growth(count(means)));
+    share = missed(count(means));
+    return grow(means, GROWTH_PX * (float)share);
   }
 
  private:
@@ -365,12 +367,12 @@ class Missed {
     return counts;
   }
 
-  // Step 4: pixels by which near surfaces grow everywhere.
-  static float growth(const Counts &counts) {
+  // Step 4: how far the map has missed parts.
+  static float missed(const Counts &counts) {
     const auto &[rim, background] = counts;
     const double excess = (rim.share() - background.share()) / std::max(1.0 - background.share(), 0.1);
     const float share = (float)(excess * rim.all / (rim.all + COUNTED));
-    return GROWTH_PX * clamp01((share - MISSED) / (MANY_MISSED - MISSED));
+    return clamp01((share - MISSED) / (MANY_MISSED - MISSED));
   }
 
   // Step 5: `ring_` becomes the distance up to which the near surface may grow onto a pixel. Lists these pixels.
@@ -452,6 +454,6 @@ class Missed {
 }  // namespace
 }  // namespace torchdof
 
-int32_t torchdof_missed_parts(const torchdof_map *map, int32_t *changed) {
-  return torchdof::guarded([&] { *changed = torchdof::Missed(*map).run(); });
+int32_t torchdof_missed_parts(const torchdof_map *map, int32_t *changed, double *share) {
+  return torchdof::guarded([&] { *changed = torchdof::Missed(*map).run(*share); });
 }

@@ -2,13 +2,18 @@
 
 Estimated depth often has its edges some pixels beside those of the image, on either side. Decisions pixel by pixel then
 leave sharp scraps beside blurred foregrounds, and rough rims on surfaces in focus. The share of the clearest pixels
-that have the colour of the surface across the edge measures this doubt. In doubt, a blurred foreground blurs its
-surroundings too, less with every pixel of distance, and everything at an edge is a little blurred.
+that have the colour of the surface across the edge measures this doubt. A map that misses parts of its foregrounds
+(:mod:`.missed`) is in doubt as well: they are found only within a few pixels, and hair is longer. In doubt, a blurred
+foreground blurs its surroundings too, less with every pixel of distance, and everything at an edge is a little blurred.
 """
 
 import torch
 from torch import Tensor
 
+from ... import native
+from ...tensors import is_in_memory, is_traced
+from ..engines.ops import EAGER, Ops
+from ..rules import active
 from .windows import highest, mean_around
 
 __all__ = ["blurred_in_doubt", "doubt_of", "is_beyond"]
@@ -25,7 +30,8 @@ _EDGE_REACH = 3  # px; distance at which surfaces on both sides of an edge are f
 _LEAST_STEP_PX = 3.0  # px; smallest difference in coc of the two surfaces of an edge
 _SHARPER = 0.7  # largest blur of a pixel beyond an edge, over that of the near surface; larger: edges within slopes
 _APART_PX = 2.0  # px; subtracted from it; larger: fewer edges
-_NEVER = -1e9  # nearness of invalid pixels
+_LARGEST_PX = 1e15  # px; largest valid coc
+_NEVER = -1e30  # nearness of invalid pixels
 
 
 def is_beyond(blur_px: Tensor, near_px: Tensor) -> Tensor:
@@ -48,7 +54,7 @@ def doubt_of(clear: Tensor, agreed: Tensor) -> Tensor:
     return ((share - _CONTRADICTED) / (_OFTEN_CONTRADICTED - _CONTRADICTED)).clamp(0.0, 1.0)
 
 
-def blurred_in_doubt(given: Tensor, repaired: Tensor, valid: Tensor, doubt: Tensor) -> Tensor:
+def blurred_in_doubt(given: Tensor, repaired: Tensor, doubt: Tensor, ops: Ops = EAGER) -> Tensor:
     """Raises the blur beside edges that the repair has moved.
 
     1. Beside a near surface with blur r, the blur is at least ``_OF_NEAR doubt r``. This fades with the share of the
@@ -56,16 +62,31 @@ def blurred_in_doubt(given: Tensor, repaired: Tensor, valid: Tensor, doubt: Tens
     2. At any edge, it is at least ``_LEAST_BLUR_PX doubt``, which fades within a few pixels.
 
     Args:
-        given: Negated coc in pixels before the repair, ``[B, 1, H, W]``.
+        given: Coc in pixels before the repair, ``[B or 1, 1, H, W]``. Invalid values stay.
         repaired: The same after it.
-        valid: Whether a pixel is valid; others stay.
         doubt: 0 to 1, ``[B, 1, 1, 1]``.
+        ops: Skips maps that are not in doubt.
 
     Returns:
-        Negated coc, ``[B, 1, H, W]``; pixels keep their side of the focus.
+        ``[B, 1, H, W]``; pixels keep their side of the focus.
     """
+    if not active().in_doubt or (not is_traced() and not (doubt > 0).any()):
+        return repaired
+    before, after = (t.detach().float().expand(doubt.shape[0], -1, -1, -1) for t in (given, repaired))
+    if not is_traced() and all(map(is_in_memory, (given, repaired))) and native.chosen():
+        items = zip(before, after, doubt.flatten().tolist(), strict=True)
+        blurred = torch.stack([native.blurred_in_doubt(a[0], b[0], c) for a, b, c in items])[:, None]
+    else:
+        blurred = ops.equal_unless(lambda: (doubt > 0).any(), _blurred(before, after, doubt), after)
+    return torch.where(blurred == after, repaired, blurred.to(repaired.dtype))
+
+
+@torch.no_grad()
+def _blurred(given: Tensor, repaired: Tensor, doubt: Tensor) -> Tensor:
+    """:func:`blurred_in_doubt` by PyTorch, for float32."""
     moved = ((repaired - given).abs() > _MOVED_PX).to(repaired.dtype)
-    nearness = torch.where(valid, repaired, _NEVER)
+    valid = repaired.abs() <= _LARGEST_PX
+    nearness = torch.where(valid, -repaired, _NEVER)
     near = highest(nearness, _REACH)
     is_near = (nearness > 0.5 * near.clamp_min(1.0)).to(nearness.dtype)
     is_beside = is_beyond(nearness.abs(), near) & (highest(moved, _REACH) > 0)
@@ -75,4 +96,4 @@ def blurred_in_doubt(given: Tensor, repaired: Tensor, valid: Tensor, doubt: Tens
     at_edge = torch.where(step > _LEAST_STEP_PX, _LEAST_BLUR_PX * mean_around(highest(moved, 1), _AT_EDGE_PX), 0.0)
     least = doubt * torch.maximum(beside, at_edge)
     is_sharper = valid & (nearness.abs() < least)
-    return torch.where(is_sharper, torch.where(nearness > 0, least, -least), repaired)
+    return torch.where(is_sharper, torch.where(nearness > 0, -least, least), repaired)

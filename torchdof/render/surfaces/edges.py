@@ -160,13 +160,16 @@ def repair_edges(image: Tensor, depth: Tensor, edges: DepthEdges = "repair") -> 
     depth = depth.expand(image.shape[0], -1, -1, -1)
     nearness = torch.where(depth > 0, 1.0 / depth.detach(), torch.nan)
     high = highest(torch.where(depth > 0, nearness, 0.0).float(), _REACH)
-    repaired = repair(image, nearness, _STEP * high, edges == "auto")
+    repaired, _ = repair(image, nearness, _STEP * high, edges == "auto")
     changed = (repaired != nearness) & (depth > 0)
     return torch.where(changed, 1.0 / repaired.clamp_min(0.0), depth)
 
 
 def mended(image: Tensor, coc_px: Tensor, edges: DepthEdges, ops: Ops = EAGER) -> Tensor:
     """Repairs the edges of a map of the coc: the first step of the pipeline.
+
+    Pixels at edges get the surface that they show, blurred foregrounds get what the map misses of them, and edges that
+    are still in doubt are blurred.
 
     Args:
         image: ``[B, C, H, W]``, linear light.
@@ -184,10 +187,11 @@ def mended(image: Tensor, coc_px: Tensor, edges: DepthEdges, ops: Ops = EAGER) -
         if high - low < _LEAST_STEP_PX:
             return coc_px
     given = coc_px.detach()
-    repaired = repair(image, given, STEP_PX, auto=edges == "auto", of_coc=True, ops=ops)
+    repaired, contradicted = repair(image, given, STEP_PX, auto=edges == "auto", of_coc=True, ops=ops)
     if repaired is given:
         return coc_px
-    repaired = completed(image, repaired, given, ops)
+    repaired, missed = completed(image, repaired, given, ops)
+    repaired = blurred_in_doubt(given, repaired, torch.maximum(contradicted, missed), ops)
     repaired = ops.equal_unless(lambda: _has_steps(coc_px), repaired, coc_px)
     return torch.where(repaired == coc_px, coc_px, repaired) if is_differentiated(coc_px) else repaired
 
@@ -200,7 +204,7 @@ def _has_steps(coc_px: Tensor) -> Tensor:
 
 def repair(
     image: Tensor, nearness: Tensor, step: Tensor | float, auto: bool, of_coc: bool = False, ops: Ops = EAGER
-) -> Tensor:
+) -> tuple[Tensor, Tensor]:
     """Repairs a map of nearness, of any scale and offset.
 
     Values that are not finite, or above 1e15 in magnitude, stay unchanged and affect no other pixel.
@@ -216,7 +220,7 @@ def repair(
 
     Returns:
         ``[B, 1, H, W]``, constant to autograd; unchanged pixels keep their values to the bit. ``nearness`` itself if
-        the compiled engine leaves all of it unchanged.
+        the compiled engine leaves all of it unchanged. And how much the map is in doubt, 0 to 1, ``[B, 1, 1, 1]``.
     """
     device = image.device.type
     if torch.is_autocast_enabled(device):  # which would compute in half precision
@@ -227,19 +231,21 @@ def repair(
     light, given = image.float(), nearness.float().expand(image.shape[0], -1, -1, -1)
     step = torch.as_tensor(step, dtype=given.dtype, device=given.device)
     if is_compiled():
-        repaired = _operator(light, given, step, auto, of_coc)
+        repaired, doubt = _operator(light, given, step, auto, of_coc)
     elif compiled:
         steps = step.expand(light.shape[0], 1, *given.shape[-2:]) if step.ndim else step.expand(light.shape[0], 1)
         maps = [of_item[0] for of_item in given]
-        items = [native.repair_edges(a, b, c[0], auto, of_coc) for a, b, c in zip(light, maps, steps, strict=True)]
+        of_items = [native.repair_edges(a, b, c[0], auto, of_coc) for a, b, c in zip(light, maps, steps, strict=True)]
+        items, doubts = zip(*of_items, strict=True)
+        doubt = given.new_tensor(doubts).view(-1, 1, 1, 1)
         if all(new is old for new, old in zip(items, maps, strict=True)):
-            return nearness
+            return nearness, doubt
         repaired = (items[0][None] if len(items) == 1 else torch.stack(items))[:, None]
     else:
-        repaired = _repair(light, given, step, auto, of_coc, ops)
+        repaired, doubt = _repair(light, given, step, auto, of_coc, ops)
     if nearness.dtype == torch.float32:
-        return repaired
-    return torch.where(repaired == given, nearness, repaired.to(nearness.dtype))
+        return repaired, doubt
+    return torch.where(repaired == given, nearness, repaired.to(nearness.dtype)), doubt
 
 
 @torch.no_grad()
@@ -263,7 +269,7 @@ def judged(image: Tensor, coc_px: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 @torch.no_grad()
 def _repair(
     image: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool = False, ops: Ops = EAGER
-) -> Tensor:
+) -> tuple[Tensor, Tensor]:
     """Plain PyTorch version of :func:`repair`.
 
     1. Find ramps and steps, and the nearness of both surfaces there.
@@ -275,7 +281,6 @@ def _repair(
        beside them.
     5. Give selected pixels the nearness of their surface, on ramps in proportion to the evidence.
     6. In soft maps, remove the ringing of interpolation beside steps, and correct lamps of a few pixels.
-    7. In soft maps of the coc that the image contradicts, blur the edges a little.
     """
     rules = active()
     if of_coc:
@@ -332,7 +337,7 @@ def _repair(
         doubtful = doubtful & is_inexact & torch.where(edges.is_ramp, is_soft, wrong > _DOUBTFUL)
     edge_pixels = pixels.indices(doubtful)
     if auto and is_empty(edge_pixels):  # nor lamps: a soft map has ramps, which are selected
-        return -nearness if of_coc else nearness
+        return -nearness if of_coc else nearness, given.new_zeros(batch, 1, 1, 1)
     score, evidence, near, far = _judge(looks, given, edge_pixels, sharpness, _CLEAR, of_coc, ops)
     shows_near = score + torch.logit(pixels.pick(prior, edge_pixels)[0])
     if auto:  # without auto, correct steps are decided too, and the lead would move them
@@ -376,20 +381,20 @@ def _repair(
         out = torch.where(is_soft, _without_ringing(out, valid, step), out)
     if rules.soft_lamps:
         out = _lift_lamps(light, given, out, step, is_soft, sigma, lost_px, doubt, ops)
-    if auto and of_coc and rules.in_doubt and (is_traced() or (doubt > 0).any()):
-        out = ops.equal_unless(lambda: (doubt > 0).any(), blurred_in_doubt(given, out, valid, doubt), out)
     out = torch.where(valid, out, nearness)
-    return -out if of_coc else out
+    return -out if of_coc else out, doubt
 
 
-def _empty(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool) -> Tensor:
-    return torch.empty_like(nearness, memory_format=torch.contiguous_format)
+def _empty(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool) -> tuple[Tensor, Tensor]:
+    out = torch.empty_like(nearness, memory_format=torch.contiguous_format)
+    return out, nearness.new_empty(nearness.shape[0], 1, 1, 1)
 
 
 # The number of pixels to process depends on the data, which compiled graphs do not support.
 @one_operator("torchdof::repair_edges", _empty)
-def _operator(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool) -> Tensor:
-    return _repair(image, nearness, step, auto, of_coc).clone()
+def _operator(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool) -> tuple[Tensor, Tensor]:
+    repaired, doubt = _repair(image, nearness, step, auto, of_coc)
+    return repaired.clone(), doubt
 
 
 def _from_border(size: int, device: torch.device) -> Tensor:

@@ -48,7 +48,7 @@ _LARGEST_PX = 1e6  # px; largest valid coc, whose square is exact enough
 _BRIGHTEST = 1e15  # largest light that is compared
 
 
-def completed(image: Tensor, coc_px: Tensor, before: Tensor, ops: Ops = EAGER) -> Tensor:
+def completed(image: Tensor, coc_px: Tensor, before: Tensor, ops: Ops = EAGER) -> tuple[Tensor, Tensor]:
     """Lets blurred foregrounds grow by what the map misses of them.
 
     Maps that the repair of edges has left as they are count as exact, and stay.
@@ -69,30 +69,32 @@ def completed(image: Tensor, coc_px: Tensor, before: Tensor, ops: Ops = EAGER) -
         ops: Skips frames without such edges.
 
     Returns:
-        The map; gradients flow to unchanged pixels.
+        The map; gradients flow to unchanged pixels. And how far the map has missed parts, 0 (the share of step 4 is at
+        most :data:`_MISSED`) to 1 (:data:`_MANY_MISSED`), ``[B, 1, 1, 1]``: some of them are still beyond its growth.
     """
-    if not active().missed_parts:
-        return coc_px
     light = image.detach().float()
     repaired, before = (t.detach().float().expand(image.shape[0], -1, -1, -1) for t in (coc_px, before))
     is_inexact = ((repaired - before).abs() > 0).flatten(1).any(1)
-    if not is_traced() and not is_inexact.any():
-        return coc_px
+    share = light.new_zeros(image.shape[0], 1, 1, 1)
+    if not active().missed_parts or (not is_traced() and not is_inexact.any()):
+        return coc_px, share
     if is_compiled():
-        near_px = _operator(light, repaired, is_inexact)
+        near_px, share = _operator(light, repaired, is_inexact)
     elif not is_traced() and all(map(is_in_memory, (image, coc_px))) and native.chosen():
         maps = [of_item[0] for of_item in repaired]
-        items = [native.missed_parts(a, b) if c else b for a, b, c in zip(light, maps, is_inexact, strict=True)]
+        of_items = [native.missed_parts(a, b) if c else (b, 0.0) for a, b, c in zip(light, maps, is_inexact, strict=True)]
+        items, shares = zip(*of_items, strict=True)
+        share = light.new_tensor(shares).view(-1, 1, 1, 1)
         if all(new is old for new, old in zip(items, maps, strict=True)):
-            return coc_px
+            return coc_px, share
         near_px = torch.stack(items)[:, None]
     else:
-        near_px = _completed(light, repaired, is_inexact, ops)
-    return torch.where(near_px == repaired, coc_px, near_px.to(coc_px.dtype))
+        near_px, share = _completed(light, repaired, is_inexact, ops)
+    return torch.where(near_px == repaired, coc_px, near_px.to(coc_px.dtype)), share
 
 
 @torch.no_grad()
-def _completed(image: Tensor, coc_px: Tensor, is_inexact: Tensor, ops: Ops) -> Tensor:
+def _completed(image: Tensor, coc_px: Tensor, is_inexact: Tensor, ops: Ops) -> tuple[Tensor, Tensor]:
     """:func:`completed` by PyTorch, for float32."""
     is_valid = (coc_px.abs() <= _LARGEST_PX) & is_inexact[:, None, None, None]
     coc, blur = torch.where(is_valid, coc_px, 0.0), torch.where(is_valid, coc_px.abs(), _FAR_PX)
@@ -106,7 +108,7 @@ def _completed(image: Tensor, coc_px: Tensor, is_inexact: Tensor, ops: Ops) -> T
         values = near
     has_edges = ring.any()
     if not is_traced() and not has_edges:
-        return coc_px
+        return coc_px, coc.new_zeros(coc.shape[0], 1, 1, 1)
 
     light = torch.where(torch.isfinite(image), image, 0.0).clamp(0.0, _BRIGHTEST).sqrt()
     is_sampled = (torch.arange(coc.shape[-2], device=coc.device) % _SAMPLED == 0)[:, None]
@@ -123,22 +125,28 @@ def _completed(image: Tensor, coc_px: Tensor, is_inexact: Tensor, ops: Ops) -> T
     (found, count), (usual, of_usual) = sums
     usual = usual / of_usual.clamp_min(1.0)
     excess = (found / count.clamp_min(1.0) - usual) / (1.0 - usual).clamp_min(0.1) * count / (count + _COUNTED)
-    growth = _GROWTH_PX * ((excess - _MISSED) / (_MANY_MISSED - _MISSED)).clamp(0.0, 1.0)
+    share = ((excess - _MISSED) / (_MANY_MISSED - _MISSED)).clamp(0.0, 1.0)
+    growth = _GROWTH_PX * share
     growth = torch.where(known, torch.where(is_smooth > 0, growth.clamp_min(_GROWTH_OVER_SMOOTH_PX), growth), 0.0)
     if not is_traced() and not (growth > 0).any():
-        return coc_px
+        return coc_px, share
 
     for grown in range(0, _GROWTH_PX, _GROWTH_STEP_PX):
         around = highest(surface, _GROWTH_STEP_PX)
         is_taken = (growth > grown) & is_beyond(blur, around)
         surface, growth = torch.where(is_taken, around, surface), torch.where(is_taken, 0.0, growth)
-    return ops.equal_unless(lambda: has_edges, torch.where(is_valid, -surface, coc_px), coc_px)
+    return ops.equal_unless(lambda: has_edges, torch.where(is_valid, -surface, coc_px), coc_px), share
+
+
+def _empty(image: Tensor, coc_px: Tensor, is_inexact: Tensor) -> tuple[Tensor, Tensor]:
+    return coc_px.new_empty(coc_px.shape), coc_px.new_empty(coc_px.shape[0], 1, 1, 1)
 
 
 # Compiled graphs do not support steps that depend on the data.
-@one_operator("torchdof::missed_parts", lambda image, coc_px, is_inexact: coc_px.new_empty(coc_px.shape))
-def _operator(image: Tensor, coc_px: Tensor, is_inexact: Tensor) -> Tensor:
-    return _completed(image, coc_px, is_inexact, EAGER).clone(memory_format=torch.contiguous_format)
+@one_operator("torchdof::missed_parts", _empty)
+def _operator(image: Tensor, coc_px: Tensor, is_inexact: Tensor) -> tuple[Tensor, Tensor]:
+    near_px, share = _completed(image, coc_px, is_inexact, EAGER)
+    return near_px.clone(memory_format=torch.contiguous_format), share
 
 
 def _compared(light: Tensor, coc: Tensor, weight: Tensor) -> tuple[Tensor, ...]:

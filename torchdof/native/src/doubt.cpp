@@ -1,0 +1,108 @@
+// Blurs the edges of maps in doubt: the compiled version of torchdof/render/surfaces/doubt.py.
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+
+#include "api.h"
+#include "constants/doubt.h"
+#include "entry.h"
+#include "grid.h"
+#include "rules.h"
+#include "simd.h"
+#include "threads.h"
+
+namespace torchdof {
+namespace {
+
+// Constants of render/surfaces/doubt.py, which gives their meanings, units and effects.
+constexpr float MOVED_PX = constants::doubt::MOVED_PX;
+constexpr int REACH = constants::doubt::REACH;
+constexpr float OF_NEAR = constants::doubt::OF_NEAR;
+constexpr float LEAST_BLUR_PX = constants::doubt::LEAST_BLUR_PX;
+constexpr int AT_EDGE_PX = constants::doubt::AT_EDGE_PX;
+constexpr int EDGE_REACH = constants::doubt::EDGE_REACH;
+constexpr float LEAST_STEP_PX = constants::doubt::LEAST_STEP_PX;
+constexpr float LARGEST_PX = constants::doubt::LARGEST_PX;
+constexpr float NEVER = constants::doubt::NEVER;
+
+constexpr int TILE = 96;  // px; side of the squares that a thread processes at once
+
+constexpr float one_over_square(int reach) { return 1.0f / (float)((2 * reach + 1) * (2 * reach + 1)); }
+
+class Blur : Frame {
+ public:
+  Blur(const float *given, const float *repaired, int height, int width, float doubt, float *out)
+      : Frame(height, width), given_(given), repaired_(repaired), doubt_(doubt), out_(out) {}
+
+  void run(int threads) const {
+    memcpy(out_, repaired_, area_ * sizeof(float));
+    const int across = (width_ + TILE - 1) / TILE, down = (height_ + TILE - 1) / TILE;
+    parallel(threads, across * down, nullptr, [&](int tile, int) {
+      const int y = tile / across * TILE, x = tile % across * TILE;
+      blur({y, x, std::min(TILE, height_ - y), std::min(TILE, width_ - x)});
+    });
+  }
+
+ private:
+  void blur(const Part &part) const {
+    const Part beside = part.grown(REACH), whole = beside.grown(REACH);
+    const Grid nearness(whole), moved(whole), rows(whole);
+    const auto near_of = [](float coc) { return std::fabs(coc) <= LARGEST_PX ? -coc : NEVER; };
+    fetch(given_, moved, near_of);
+    fetch(repaired_, nearness, near_of);
+    vec any{};
+    each_vector(whole, [&](int y, int x) {
+      const vec change = abs(load<vec>(nearness.at(y, x)) - load<vec>(moved.at(y, x)));
+      store(moved.at(y, x), change > MOVED_PX ? broadcast(1.0f) : vec{});
+      any = max(any, load<vec>(moved.at(y, x)));
+    });
+    if (!(reduce_max(any) > 0)) return;
+
+    const Grid near(beside), is_near(beside), share(part), is_beside(part);
+    max_filter<REACH>(nearness, near, rows, beside);
+    each_vector(beside, [&](int y, int x) {
+      const vec half = 0.5f * max(load<vec>(near.at(y, x)), broadcast(1.0f));
+      store(is_near.at(y, x), load<vec>(nearness.at(y, x)) > half ? broadcast(1.0f) : vec{});
+    });
+    clamp_to_frame(is_near, beside);
+    sums<REACH>(is_near, share, rows, part, one_over_square(REACH));
+    max_filter<REACH>(moved, is_beside, rows, part);
+
+    const Part at_edge = part.grown(AT_EDGE_PX), around = part.grown(EDGE_REACH);
+    const Grid farness(around), high(part), low(part), edge(at_edge), fading(part);
+    each_vector(around, [&](int y, int x) {
+      const vec own = load<vec>(nearness.at(y, x));
+      store(farness.at(y, x), own > NEVER ? -own : own);
+    });
+    max_filter<EDGE_REACH>(nearness, high, rows, part);
+    max_filter<EDGE_REACH>(farness, low, rows, part);
+    each_vector(at_edge, [&](int y, int x) { store(edge.at(y, x), max_3x3(moved.at(y, x), moved.pitch)); });
+    clamp_to_frame(edge, at_edge);
+    sums<AT_EDGE_PX>(edge, fading, rows, part, one_over_square(AT_EDGE_PX));
+
+    for (int y = part.y0; y < part.bottom(); y++)
+      for (int x = part.x0; x < part.right(); x++) {
+        const float own = *nearness.at(y, x), nearest = *near.at(y, x);
+        float least = 0;
+        if (*is_beside.at(y, x) > 0 && is_beyond(std::fabs(own), nearest))
+          least = OF_NEAR * nearest * std::min(2.0f * *share.at(y, x), 1.0f);
+        if (*high.at(y, x) + *low.at(y, x) > LEAST_STEP_PX)
+          least = std::max(least, LEAST_BLUR_PX * *fading.at(y, x));
+        least *= doubt_;
+        if (std::fabs(own) < least) out_[(size_t)y * width_ + x] = own > 0 ? -least : least;
+      }
+  }
+
+  const float *given_, *repaired_;
+  const float doubt_;
+  float *out_;
+};
+
+}  // namespace
+}  // namespace torchdof
+
+int32_t torchdof_blurred_in_doubt(const float *given, const float *repaired, int32_t height, int32_t width, float doubt,
+                                  int32_t threads, float *out) {
+  return torchdof::guarded([&] { torchdof::Blur(given, repaired, height, width, doubt, out).run(threads); });
+}
