@@ -87,8 +87,7 @@ class Blur : Frame {
         float least = 0;
         if (*is_beside.at(y, x) > 0 && is_beyond(std::fabs(own), nearest))
           least = OF_NEAR * nearest * std::min(2.0f * *share.at(y, x), 1.0f);
-        if (*high.at(y, x) + *low.at(y, x) > LEAST_STEP_PX)
-          least = std::max(least, LEAST_BLUR_PX * *fading.at(y, x));
+        if (*high.at(y, x) + *low.at(y, x) > LEAST_STEP_PX) least = std::max(least, LEAST_BLUR_PX * *fading.at(y, x));
         least *= doubt_;
         if (std::fabs(own) < least) out_[(size_t)y * width_ + x] = own > 0 ? -least : least;
       }

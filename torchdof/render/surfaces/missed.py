@@ -82,8 +82,8 @@ def completed(image: Tensor, coc_px: Tensor, before: Tensor, ops: Ops = EAGER) -
         near_px, share = _operator(light, repaired, is_inexact)
     elif not is_traced() and all(map(is_in_memory, (image, coc_px))) and native.chosen():
         maps = [of_item[0] for of_item in repaired]
-        of_items = [native.missed_parts(a, b) if c else (b, 0.0) for a, b, c in zip(light, maps, is_inexact, strict=True)]
-        items, shares = zip(*of_items, strict=True)
+        of_items = zip(light, maps, is_inexact, strict=True)
+        items, shares = zip(*(native.missed_parts(a, b) if c else (b, 0.0) for a, b, c in of_items), strict=True)
         share = light.new_tensor(shares).view(-1, 1, 1, 1)
         if all(new is old for new, old in zip(items, maps, strict=True)):
             return coc_px, share
