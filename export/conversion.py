@@ -37,7 +37,7 @@ def to_onnx(
     inputs: str = "depth",
     channels: int = 3,
     width: int | None = None,
-    depth_edges: DepthEdges = "as given",
+    depth_edges: DepthEdges | None = None,
     layout: Layout = "tiles",
     size: Size = None,
     opset: int = OPSET,
@@ -66,9 +66,8 @@ def to_onnx(
         channels: Channels of the image, C.
         width: Required for a table with lengths in millimetres or fractions of the width: the image width for which the
             file's kernels are made. The file uses the same kernel for a radius in pixels at any width.
-        depth_edges: Repair of the map's edges in the graph, regardless of the option of ``dof``: ``"as given"`` none,
-            ``"auto"`` and ``"repair"`` as in :class:`DepthOfField`, for the time of several renderings
-            (docs/embedding.md).
+        depth_edges: As in :class:`DepthOfField`. None takes the option of ``dof``; ``layout="whole"`` can only leave
+            edges as given, and does so by default. The repair doubles the time of a frame (docs/embedding.md).
         layout: ``"tiles"`` or ``"whole"``, see above.
         size: For the layout ``"whole"``, height and width of the only frame that the graph takes, in a batch of one:
             fewer operations, for runtimes that need fixed sizes.

@@ -58,7 +58,7 @@ class Portable(nn.Module):
         dof: DepthOfField,
         inputs: str = "depth",
         width: int | None = None,
-        depth_edges: DepthEdges = "as given",
+        depth_edges: DepthEdges | None = None,
         layout: Layout = "tiles",
         size: Size = None,
     ) -> None:
@@ -75,6 +75,8 @@ class Portable(nn.Module):
             raise ValueError(f'size is for layout="whole"; tiles are for frames of any size, got size={size!r}')
         if size is not None and (len(size) != 2 or any(not isinstance(n, int) or n < 1 for n in size)):
             raise ValueError(f"size must be height and width of a frame in pixels, such as (1080, 1920), got {size!r}")
+        if depth_edges is None:
+            depth_edges = "as given" if layout == "whole" else dof.options.depth_edges
         routes.refuse(dof.options, "whole file" if layout == "whole" else "file", repairs=depth_edges != "as given")
         table = dof.options.table
         if table.unit == "relative" and width is not None:

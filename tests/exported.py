@@ -94,12 +94,12 @@ def export_once(name: str, folder: Path) -> Exported:
 
 
 def command_once(folder: Path) -> tuple[Path, str]:
-    """A file of one channel with blur radii as input and repair of edges, and the output of ``torchdof export``."""
+    """A file of one channel with blur radii as input, and the output of ``torchdof export``."""
     path, output = folder / "command" / "dof.onnx", folder / "command.json"
     with FileLock(folder / "command.lock"):
         if not output.exists():
             path.parent.mkdir()
-            options = "--inputs coc_px --channels 1 --max-coc 2 --no-occlusion --depth-edges auto --opset 21 --json"
+            options = "--inputs coc_px --channels 1 --max-coc 2 --no-occlusion --opset 21 --json"
             result = CliRunner().invoke(app, ["export", "-o", str(path), *options.split()], catch_exceptions=False)
             assert result.exit_code == 0, result.output
             output.write_text(result.stdout)

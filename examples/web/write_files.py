@@ -43,7 +43,7 @@ def write_shapes(out: Path) -> list[str]:
     for file, (name, table) in SHAPES.items():
         dof = torchdof.DepthOfField(camera, table, tolerance=TOLERANCE, max_coc_px=MAX_COC_PX, check=False)
         try:
-            print(f"{name}: {to_onnx(dof, out / file, depth_edges=dof.options.depth_edges)}", flush=True)
+            print(f"{name}: {to_onnx(dof, out / file)}", flush=True)
         except (ValueError, RuntimeError, MemoryError) as error:
             print(f"warning: the page is without the shape {name!r}: {error}", file=sys.stderr, flush=True)
         else:

@@ -49,8 +49,8 @@ def test_a_shape_that_cannot_be_written_is_left_out(
     assert [name for name, _ in script.SHAPES.values()] == ["Round", "Six blades", "Soft, a Gaussian"]
     edges, radii = [], []
 
-    def to_onnx(dof: torchdof.DepthOfField, path: Path, depth_edges: str) -> str:
-        edges.append(depth_edges)
+    def to_onnx(dof: torchdof.DepthOfField, path: Path) -> str:
+        edges.append(dof.options.depth_edges)
         radii.append(dof.max_coc_px)
         if path.name == failing or failing == "all":
             raise ValueError("the file differs from the module")

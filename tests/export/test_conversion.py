@@ -14,6 +14,7 @@ from torchdof.export import conversion, to_onnx
 from torchdof.export.graph import Portable, trace
 from torchdof.export.rays import kernels_of
 from torchdof.export.verification import session
+from torchdof.options import DepthEdges
 
 CAMERA = torchdof.Camera.from_fov(50.0, 0.05, 2.0)
 SIMPLE: dict[str, Any] = {"occlusion": False, "tolerance": "draft", "max_coc_px": 1.0, "check": False}
@@ -64,6 +65,14 @@ def test_the_graph_has_standard_operators_and_loops_that_skip_layers_without_pix
             maker = weight.producer()
             makers = [maker] if maker.op_type != "Gather" else [value.producer() for value in maker.inputs]
             assert all(m.op_type in ("Constant", "ConstantOfShape") and m.graph is node.graph for m in makers)
+
+
+@pytest.mark.parametrize("depth_edges", ["auto", "repair", "as given"])
+def test_a_file_treats_edges_as_its_module_unless_it_cannot(depth_edges: DepthEdges) -> None:
+    dof = torchdof.DepthOfField(CAMERA, max_coc_px=2.0, depth_edges=depth_edges)
+    assert Portable(dof).dof.options.depth_edges == depth_edges
+    assert Portable(dof, layout="whole").dof.options.depth_edges == "as given"
+    assert Portable(dof, depth_edges="repair").dof.options.depth_edges == "repair"
 
 
 CATS_EYES = torchdof.BlurTable.polygon(5, vignetting=0.4)

@@ -79,10 +79,10 @@ class Export(Sensor, Blur, Accuracy, _Graph, Command):
             camera = Camera(**{name: getattr(self, name) for name in self.given(Sensor)})
         else:
             camera = Camera.from_fov(self.fov_deg, 0.01, 2.0)  # aperture and focus are inputs of the graph
-        options = {"depth_edges": "as given", **self.arguments(), "max_coc_px": self.max_coc, "check": False}
+        options = {**self.arguments(), "max_coc_px": self.max_coc, "check": False}
         with progress_bar("tracing") as update:
             dof = DepthOfField(camera, self.blur_table(), **options)
             graph = {field.name: getattr(self, field.name) for field in dataclasses.fields(_Graph)}
-            report = to_onnx(dof, self.out, **graph, depth_edges=dof.options.depth_edges, progress=update)
+            report = to_onnx(dof, self.out, **graph, depth_edges=options.get("depth_edges"), progress=update)
         facts = {"out": str(self.out), **dataclasses.asdict(report)}
         print_result(self.as_json, facts, f"{report}\nwrote {self.out}")

@@ -195,7 +195,7 @@ class Accuracy(Group):
     method: Literal["layered", "fold"] = option("fold is the literal scatter: exact, slow, for small radii.", "layered")
     depth_edges: Literal["auto", "repair", "as-given"] | None = option(
         "Move edges of the depth to those of the image: auto unless they prove exact, repair each one, as-given never. "
-        "Default: auto; in exported files as-given.",
+        "Default: auto; in exported files with --layout whole, which cannot repair them, as-given.",
         group="Depth map",
     )
 
