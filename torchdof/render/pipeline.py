@@ -67,7 +67,7 @@ def blur(
         return torch.cat([blur(i, c, plan, options, tuple(b) or None, w, ops, a) for i, c, w, a, *b in items])
     coc_px, covered = edges.mended(image, coc_px, options.depth_edges, ops), None
     if matte is not None:
-        coc_px, covered = covered_by(image, coc_px, matte, highlights.threshold)
+        coc_px, covered = covered_by(image, coc_px, matte, highlights.threshold, ops)
     whole = functools.partial(_planned, image, coc_px, behind=behind, ops=ops, covered=covered)
     if attention is None:
         return whole(plan, options)

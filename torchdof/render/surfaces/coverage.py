@@ -22,6 +22,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from ...tensors import is_traced
+from ..engines.ops import EAGER, Ops
 from ..layers.downsampling import downsampled, upsampled
 from .windows import highest
 
@@ -36,7 +37,11 @@ _LEAST = 1e-4  # (1 %)^2: smallest variance of a surface's light, as a fraction 
 
 
 def covered_by(
-    image: Tensor, coc_px: Tensor, matte: Tensor, threshold: Callable[[Tensor, Tensor], Tensor]
+    image: Tensor,
+    coc_px: Tensor,
+    matte: Tensor,
+    threshold: Callable[[Tensor, Tensor], Tensor],
+    ops: Ops = EAGER,
 ) -> tuple[Tensor, Tensor | None]:
     """Both surfaces of the pixels at the edges of a matte, where the depth has an edge too.
 
@@ -51,6 +56,7 @@ def covered_by(
         matte: Coverage by the subject, ``[B or 1, 1, H, W]``, in [0, 1].
         threshold: Gives the light above which a pixel is a highlight, of an image and of the validity of its pixels:
             :func:`torchdof.render.highlights.threshold`.
+        ops: Skips mattes without an edge.
 
     Returns:
         The map of the coc, ``[B, 1, H, W]``; and the other surfaces, ``[B, C + 3, H, W]``: their part of the pixel's
@@ -59,8 +65,24 @@ def covered_by(
         have a certainty of 0. None if the matte has no edge. Gradients flow to all arguments.
     """
     matte = torch.nan_to_num(matte).clamp(0.0, 1.0)  # for unchecked input
-    if not is_traced() and not bool((_change(matte.detach(), 3) > 0).any()):
+
+    def has_edge() -> Tensor:
+        return (_change(matte.detach(), 3) > 0).any()
+
+    if not is_traced() and not has_edge():
         return coc_px, None
+    moved, others = _covered_by(image, coc_px, matte, threshold)
+    items, channels, height, width = image.shape
+    uncovered = torch.zeros_like(image[:, :1], dtype=moved.dtype).expand(-1, channels + 3, -1, -1)
+    none = torch.cat([coc_px.to(moved.dtype).expand(items, -1, height, width), uncovered], 1)
+    moved, others = ops.equal_unless(has_edge, torch.cat([moved, others], 1), none).split([1, channels + 3], 1)
+    return moved, others
+
+
+def _covered_by(
+    image: Tensor, coc_px: Tensor, matte: Tensor, threshold: Callable[[Tensor, Tensor], Tensor]
+) -> tuple[Tensor, Tensor]:
+    """:func:`covered_by` of a matte that has an edge."""
     wide = torch.promote_types(torch.promote_types(image.dtype, coc_px.dtype), torch.float32)
     light, (coc, cover) = image.to(wide), (t.to(wide).expand(image.shape[0], -1, -1, -1) for t in (coc_px, matte))
     known = torch.isfinite(coc) & torch.isfinite(light).all(1, keepdim=True)
