@@ -28,7 +28,7 @@ const python = process.env.PYTHON ?? (existsSync(ownPython) ? ownPython : 'pytho
 rmSync(options.out, { recursive: true, force: true })
 mkdirSync(options.out, { recursive: true })
 cpSync(join(here, 'src'), options.out, { recursive: true })
-for (const name of ['depth.mjs', 'depth_of_field.mjs', 'light.mjs', 'png.mjs']) {
+for (const name of ['depth.mjs', 'depth_of_field.mjs', 'light.mjs', 'matte.mjs', 'png.mjs']) {
   cpSync(join(here, '..', 'embed', 'javascript', name), join(options.out, name))
 }
 for (const name of ['ort.wasm.min.mjs', 'ort-wasm-simd-threaded.mjs', 'ort-wasm-simd-threaded.wasm']) {

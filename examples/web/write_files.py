@@ -43,7 +43,8 @@ def write_shapes(out: Path) -> list[str]:
     for file, (name, table) in SHAPES.items():
         dof = torchdof.DepthOfField(camera, table, tolerance=TOLERANCE, max_coc_px=MAX_COC_PX, check=False)
         try:
-            print(f"{name}: {to_onnx(dof, out / file)}", flush=True)
+            report = to_onnx(dof, out / file, inputs="depth+matte")
+            print(f"{name}: {report}", flush=True)
         except (ValueError, RuntimeError, MemoryError) as error:
             print(f"warning: the page is without the shape {name!r}: {error}", file=sys.stderr, flush=True)
         else:
@@ -71,6 +72,7 @@ def main() -> None:
         "sensor_width_mm": metadata["camera"]["sensor_width_mm"],
         "max_coc_px": metadata["options"]["max_coc_px"],
         "tile_px": TILE_PX,
+        "takes_matte": "matte" in metadata["inputs"],
         "shapes": [{"file": file, "name": SHAPES[file][0]} for file in written],
     }
     (arguments.out / "dof.json").write_text(json.dumps(page_settings))

@@ -142,3 +142,13 @@ def test_relative_depth_and_bad_files_are_explained(used: Any) -> None:
     assert "1.1 %" in seen["slowPair"][1], "maps of nearly the photo's shape are stretched"
     assert "90 × 60" in problems["frame"] and "60 × 90: turned by 90 degrees it fits" in problems["frame"]
     assert "50.0 %; it is stretched to the photo" in seen["squareNote"]
+
+
+def test_a_mask_of_the_subject_is_rendered_with_its_photograph_alone(used: Any) -> None:
+    _, seen = used
+    (width, height, values), *_ = seen["matte"]
+    assert (width, height) == (45, 30) and seen["matteName"] == "own.png"
+    rows = np.reshape(values, (height, width))
+    assert rows[:, 0].max() < 0.05 and rows[:, -1].min() > 0.95, "white is the subject"
+    assert "its mask 60 × 60: it must have the shape of the photo" in seen["problems"]["matte"]
+    assert seen["matteLeftOut"].startswith("optional") and seen["matteOfSample"].startswith("optional")

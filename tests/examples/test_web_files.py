@@ -49,7 +49,8 @@ def test_a_shape_that_cannot_be_written_is_left_out(
     assert [name for name, _ in script.SHAPES.values()] == ["Round", "Six blades", "Soft, a Gaussian"]
     edges, radii = [], []
 
-    def to_onnx(dof: torchdof.DepthOfField, path: Path) -> str:
+    def to_onnx(dof: torchdof.DepthOfField, path: Path, inputs: str) -> str:
+        assert inputs == "depth+matte"
         edges.append(dof.options.depth_edges)
         radii.append(dof.max_coc_px)
         if path.name == failing or failing == "all":

@@ -11,7 +11,7 @@ const require = createRequire(join(process.env.TORCHDOF_NODE_FOLDER, 'package.js
 const { chromium } = require('playwright-core')
 // tiles of 256 px, so that the sample has several
 const settings = JSON.parse(readFileSync(join(dist, 'dof.json')))
-writeFileSync(join(dist, 'dof.json'), JSON.stringify({ ...settings, tile_px: 256 }))
+writeFileSync(join(dist, 'dof.json'), JSON.stringify({ ...settings, tile_px: 256, takes_matte: true }))
 const root = join(dirname(fileURLToPath(import.meta.url)), '..', '..')
 const server = spawn('node', [join(root, 'examples', 'web', 'serve.mjs'), dist, '0'])
 const address = await new Promise((resolve) => server.stdout.once('data', (text) => resolve(String(text).trim())))
@@ -23,7 +23,7 @@ await context.addInitScript(() => {
   window.asked = []
   const post = Worker.prototype.postMessage
   Worker.prototype.postMessage = function (message, ...rest) {
-    window.asked.push({ type: message.type, size: message.size })
+    window.asked.push({ type: message.type, size: message.size, matte: message.matte })
     return post.call(this, message, ...rest)
   }
 })
@@ -191,7 +191,22 @@ try {
   await done()
   results.squareNote = await text('#depth-note')
 
+  // A mask of the subject, of any size in the shape of the photograph: it goes with the photograph.
+  await asked()
+  const mask = await picture(45, 30, ['#000', '#fff'])
+  await page.setInputFiles('#depth-file', { name: 'own_depth.png', mimeType: 'image/png', buffer: await picture(90, 60, ['#fff', '#000']) })
+  await page.setInputFiles('#matte-file', { name: 'own.png', mimeType: 'image/png', buffer: mask })
+  await page.waitForFunction(() => window.asked.some((message) => message.matte))
+  results.matte = (await asked()).filter((message) => message.matte).map(({ matte }) => [matte.width, matte.height, Object.values(matte.values)])
+  results.matteName = await text('[data-slot=matte] small')
+  results.problems.matte = await problemOf('#matte-file', 'square_mask.png', 'image/png', await picture(60, 60, ['#000', '#fff']))
+  await done()
+  results.matteLeftOut = await text('[data-slot=matte] small')
+  await page.setInputFiles('#matte-file', { name: 'own.png', mimeType: 'image/png', buffer: mask })
+  await page.waitForFunction(() => document.querySelector('[data-slot=matte] small').textContent === 'own.png')
   await page.click('#sample')
+  await page.waitForFunction(() => document.querySelector('[data-slot=photo] small').textContent === 'motorcycle.png')
+  results.matteOfSample = await text('[data-slot=matte] small')
   await done()
   for (const [name, width, height, colorScheme] of [
     ['desktop_light', 1280, 860, 'light'],

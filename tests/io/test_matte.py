@@ -51,6 +51,11 @@ def test_labels_of_0_and_1_are_coverage_too(name: str, kind: type, tmp_path: Pat
     assert torch.equal(read_matte(labels), torch.tensor([[[[0.0, 1.0, 1.0]]]]))
 
 
+def test_shades_of_grey_are_coverage_where_nothing_is_transparent(tmp_path: Path) -> None:
+    opaque = np.stack([*[GREY.astype(np.uint8)] * 3, np.full(GREY.shape, 255, np.uint8)], -1)
+    torch.testing.assert_close(read_matte(stored(tmp_path / "m.png", opaque)), EXPECTED)
+
+
 def test_a_smaller_mask_is_resampled_to_the_photograph(tmp_path: Path) -> None:
     mask = read_matte(stored(tmp_path / "m.png", np.full((4, 6), 255, np.uint8)), (8, 12))
     assert torch.equal(mask, torch.ones(1, 1, 8, 12))

@@ -20,7 +20,7 @@ def read_matte(path: str | os.PathLike[str], size: Sequence[int] | None = None, 
     """Reads a subject's mask: ``[1, 1, H, W]`` float32 coverage in [0, 1].
 
     The numbers are coverage, without a transfer curve: whole numbers are divided by the largest of their type (255 for
-    8 bits), or are 0 and 1 already. Of a cut-out with an alpha channel, as rembg writes it, alpha is the coverage.
+    8 bits), or are 0 and 1 already. Of a cut-out with transparent pixels, as rembg writes it, alpha is the coverage.
 
     Args:
         path: An image of one channel, of equal ones or with alpha; or a ``.npy`` or ``.npz`` file.
@@ -47,10 +47,13 @@ def read_matte(path: str | os.PathLike[str], size: Sequence[int] | None = None, 
         else:
             part = read_parts(path)[0]
             own_window = part.window if part.is_exr else None
-            if "A" in part.names and len(part.names) > 1:
-                values = part.values[..., part.names.index("A")]
-            elif bool((part.values == part.values[..., :1]).all()):
-                values = part.values[..., 0]
+            alpha = part.values[..., part.names.index("A")] if "A" in part.names else None
+            shades = part.values[..., [name != "A" for name in part.names]]
+            opaque = 1.0 if part.values.dtype.kind == "f" else np.iinfo(part.values.dtype).max
+            if alpha is not None and (len(part.names) == 1 or bool((alpha < opaque).any())):
+                values = alpha
+            elif bool((shades == shades[..., :1]).all()):
+                values = shades[..., 0]
             else:
                 raise ValueError(f"a matte must have one channel or alpha, it has {', '.join(part.names)}, all unequal")
         if values.dtype.kind in "iu" and (values.size == 0 or values.max() > 1):

@@ -1,13 +1,15 @@
 // Opens files as pictures and depth maps; errors state the remedy.
 
 import { extremes, greyDepthMap, readDepthMap } from './depth.mjs'
+import { readCoverage } from './matte.mjs'
 import { isPng } from './png.mjs'
 
 const MOST_PIXELS = 16e6 // what phones' browsers draw at once
 
-/** Kind of a file, 'photo' or 'depth', by its name, then by its content. */
+/** Kind of a file, 'photo', 'depth' or 'matte', by its name, then by its content. */
 export async function kindOf(file) {
   if (/depth|disp|\.npy$/i.test(file.name)) return 'depth'
+  if (/matte|mask|alpha/i.test(file.name)) return 'matte'
   const start = new Uint8Array(await file.slice(0, 33).arrayBuffer())
   const isGrey = isPng(start) && (start[25] === 0 || start[25] === 4)
   return isGrey ? 'depth' : 'photo'
@@ -29,6 +31,16 @@ export async function readDepth(file) {
     const [low, high] = extremes(map.values)
     if (!(low < high)) throw new Error('it has one value everywhere: nothing tells near from far. Choose another file.')
     return { name: file.name, map }
+  } catch (error) {
+    throw new Error(`${file.name}: ${error.message}`)
+  }
+}
+
+/** @returns {Promise<{name, map: {values: Float32Array, width, height}}>} coverage by the subject, 0 to 1. */
+export async function readMatte(file) {
+  try {
+    const bytes = new Uint8Array(await file.arrayBuffer())
+    return { name: file.name, map: await readCoverage(bytes, () => pixelsOf(file)) }
   } catch (error) {
     throw new Error(`${file.name}: ${error.message}`)
   }

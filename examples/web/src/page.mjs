@@ -2,7 +2,7 @@
 
 import { fNumberFor, guessMeaning, inOrder, knownMap, subjectOf } from './assumed.mjs'
 import { depthAtSize, extremes, fillHoles, metresOf } from './depth.mjs'
-import { kindOf, readDepth, readPhoto } from './files.mjs'
+import { kindOf, readDepth, readMatte, readPhoto } from './files.mjs'
 import { cocPx, depthPicture, distanceAt } from './optics.mjs'
 import { encodePng } from './png.mjs'
 import { Renderer } from './renderer.mjs'
@@ -18,6 +18,7 @@ const SAME_SHAPE = 0.03 // largest difference between shapes that are meant to b
 let camera
 let photo = null // {name, rgba, width, height}
 let depthFile = null // {name, map}
+let matteFile = null // {name, map}, whose values are coverage by the subject
 let isSample = false
 let scene = null // {photo, depth: {metres, width, height}, distances, width, height, nearM, farM}
 let focus = { nearM: 2, farM: 2 } // all between these distances is in focus
@@ -70,20 +71,25 @@ async function take(files, slot = null) {
   if (!files.length) return
   complain(null)
   try {
-    const earlierDepth = depthFile
-    const opened = { photo: null, depth: null }
+    const earlier = { depthFile, matteFile }
+    const opened = { photo: null, depth: null, matte: null }
     for (const file of files) {
       const kind = slot ?? (await kindOf(file))
-      opened[kind] = kind === 'photo' ? await readPhoto(file) : await readDepth(file)
+      opened[kind] = await { photo: readPhoto, depth: readDepth, matte: readMatte }[kind](file)
     }
-    // the depth of the photo that goes; not one that was chosen while the new photo was read
-    if (depthFile === earlierDepth && (isSample || (opened.photo && photo))) depthFile = null
-    if (isSample) photo = null
-    isSample = false
+    // depth and mask of the photo that goes; not those that were chosen while the new photo was read
+    const isOther = (isSample && !opened.matte) || (opened.photo && photo)
+    if (isOther && depthFile === earlier.depthFile) depthFile = null
+    if (isOther && matteFile === earlier.matteFile) matteFile = null
+    if (isSample && isOther) photo = null
+    isSample &&= !isOther
     photo = opened.photo ?? photo
     depthFile = opened.depth ?? depthFile
-    isFocusChosen = false
-    $('automatic').checked = true
+    matteFile = opened.matte ?? matteFile
+    if (opened.photo || opened.depth) {
+      isFocusChosen = false
+      $('automatic').checked = true
+    }
     if (opened.depth) setMeaning(guessMeaning(depthFile.map))
     arrange()
   } catch (error) {
@@ -103,6 +109,7 @@ async function takeSample() {
     )
     photo = await readPhoto(photoFile)
     depthFile = await readDepth(depth)
+    matteFile = null
     isSample = true
     isFocusChosen = false
     $('automatic').checked = true
@@ -143,7 +150,16 @@ function arrange() {
   if (stretch > SAME_SHAPE && difference(ours, 1 / theirs) <= SAME_SHAPE) {
     throw new Error(
       `The photo is ${photo.width} × ${photo.height}, its depth map ${map.width} × ${map.height}: turned by 90 degrees it ` +
-        'fits. Turn one of them.',
+        'fits. It needs the orientation of the photo: turn one.',
+    )
+  }
+  if (matteFile && difference(ours, matteFile.map.width / matteFile.map.height) > SAME_SHAPE) {
+    const { width, height } = matteFile.map
+    matteFile = null
+    showTiles(map)
+    complain(
+      `The photo is ${photo.width} × ${photo.height}, its mask ${width} × ${height}: it must have the shape of the photo. The ` +
+        'picture is rendered without it.',
     )
   }
   const metres = metresOf(map, {
@@ -167,7 +183,7 @@ function arrange() {
   noteDepth(holes, stretch)
   $('lens').disabled = false
   stage.setActive(true)
-  renderer.setScene({ photo, depth: scene.depth, width: scene.width, height: scene.height, file: $('shape').value })
+  renderer.setScene({ photo, depth: scene.depth, matte: matteFile?.map ?? null, width: scene.width, height: scene.height, file: $('shape').value })
   if (isFocusChosen) focusOnPoints(stage.points, true)
   else focusOnSubject()
 }
@@ -198,11 +214,13 @@ function showTiles(map) {
   const pictures = {
     photo: photo && { name: photo.name, image: new ImageData(photo.rgba, photo.width, photo.height) },
     depth: depthFile && { name: depthFile.name, image: greyImage(map) },
+    matte: matteFile && { name: matteFile.name, image: greyImage(matteFile.map) },
   }
   for (const [slot, shown] of Object.entries(pictures)) {
     const tile = document.querySelector(`[data-slot=${slot}]`)
-    tile.classList.toggle('missing', !shown)
-    tile.querySelector('small').textContent = shown ? shown.name : 'choose or drop a file'
+    const isOptional = slot === 'matte'
+    tile.classList.toggle('missing', !shown && !isOptional)
+    tile.querySelector('small').textContent = shown?.name ?? (isOptional ? 'optional: where hair ends' : 'choose or drop a file')
     const canvas = tile.querySelector('canvas')
     canvas.getContext('2d').clearRect(0, 0, canvas.width, canvas.height)
     if (shown) drawCovering(canvas, shown.image)
@@ -399,7 +417,7 @@ function listen() {
   $('shape').addEventListener('change', () => scene && update(true))
   $('full').addEventListener('change', () => scene && describeLens())
   for (const radio of document.querySelectorAll('[name=view]')) radio.addEventListener('change', showView)
-  for (const slot of ['photo', 'depth']) {
+  for (const slot of ['photo', 'depth', 'matte']) {
     $(`${slot}-file`).addEventListener('change', ({ target }) => {
       const files = [...target.files]
       target.value = '' // so that the same file, mended, can be chosen again
@@ -425,5 +443,6 @@ function listen() {
 camera = await (await fetch('dof.json')).json()
 $('shape').append(...camera.shapes.map(({ name, file }) => new Option(name, file)))
 $('shape').closest('.pair').hidden = camera.shapes.length < 2
+document.querySelector('[data-slot=matte]').hidden = !camera.takes_matte
 listen()
 await takeSample()

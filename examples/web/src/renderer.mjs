@@ -17,7 +17,7 @@ export class Renderer {
     this.#start()
   }
 
-  /** Set the scene: {photo, depth, width, height, file}; the exported file is loaded first. */
+  /** Set the scene: {photo, depth, matte or null, width, height, file}; the exported file is loaded first. */
   setScene(scene) {
     this.scene = { ...scene, sceneId: ++this.sceneId }
     this.wanted = null

@@ -1,6 +1,6 @@
 // Renders in a worker, so that the page stays responsive.
 //
-// Takes {type: 'scene', photo, depth, width, height, file}, then {type: 'render', size, file, focus, fNumber, tilePx, reachPx}, where
+// Takes {type: 'scene', photo, depth, matte or null, width, height, file}, then {type: 'render', size, file, focus, fNumber, tilePx, reachPx}, where
 // size is 'half' or 'shown', that of the scene, or 'full', that of the photograph, and focus is {nearM, farM}.
 // Gives {type: 'ready'}, {type: 'sharp', rgba, width, height}, {type: 'tile', done, count},
 // {type: 'picture', size, rgba, width, height} or {type: 'failed', message}.
@@ -9,6 +9,7 @@ import * as ort from './ort.wasm.min.mjs'
 import { depthAtSize } from './depth.mjs'
 import { DepthOfField } from './depth_of_field.mjs'
 import { linearLight, srgbBytes } from './light.mjs'
+import { coverageAtSize } from './matte.mjs'
 import { withoutRange } from './optics.mjs'
 
 ort.env.wasm.wasmPaths = new URL('./', import.meta.url).href
@@ -16,7 +17,7 @@ ort.env.wasm.numThreads = self.crossOriginIsolated ? Math.min(8, navigator.hardw
 
 let scene
 const loaded = new Map() // file -> promise of its DepthOfField
-const sizes = new Map() // 'half' or 'shown' -> light and depth at that size
+const sizes = new Map() // 'half' or 'shown' -> light, depth and matte at that size
 
 function lensOf(file) {
   if (!loaded.has(file)) loaded.set(file, load(file))
@@ -33,7 +34,7 @@ async function load(file) {
 
 function atSize(size) {
   if (!sizes.has(size)) {
-    const { photo, depth } = scene
+    const { photo, depth, matte } = scene
     const width = size === 'half' ? Math.ceil(scene.width / 2) : scene.width
     const height = size === 'half' ? Math.ceil(scene.height / 2) : scene.height
     sizes.set(size, {
@@ -41,6 +42,7 @@ function atSize(size) {
       height,
       light: linearLight(photo.rgba, photo.width, photo.height, width, height),
       depth: depthAtSize(depth.metres, depth.width, depth.height, width, height),
+      matte: matte && coverageAtSize(matte, width, height),
     })
   }
   return sizes.get(size)
@@ -48,8 +50,9 @@ function atSize(size) {
 
 async function render({ size, file, focus, fNumber }) {
   const dof = await lensOf(file)
-  const { light, depth, width, height } = atSize(size)
-  const rgba = srgbBytes(await dof.render(light, withoutRange(depth, focus), width, height, focus.nearM, fNumber))
+  const { light, depth, matte, width, height } = atSize(size)
+  const out = await dof.render(light, withoutRange(depth, focus), width, height, focus.nearM, fNumber, matte)
+  const rgba = srgbBytes(out)
   self.postMessage({ type: 'picture', size, rgba, width, height }, [rgba.buffer])
 }
 
@@ -64,6 +67,7 @@ async function renderTiles({ file, focus, fNumber, tilePx, reachPx }) {
   const { rgba: photo, width, height } = scene.photo
   const { depth: map } = scene
   const depth = withoutRange(depthAtSize(map.metres, map.width, map.height, width, height), focus)
+  const matte = scene.matte && coverageAtSize(scene.matte, width, height)
   const margin = 2 * Math.ceil(reachPx) + 32
   const rgba = new Uint8ClampedArray(4 * width * height)
   const count = Math.ceil(width / tilePx) * Math.ceil(height / tilePx)
@@ -76,7 +80,8 @@ async function renderTiles({ file, focus, fNumber, tilePx, reachPx }) {
       const [w, h] = [x1 - x0, y1 - y0]
       const light = linearLight(part(photo, 4 * width, 4 * x0, 4 * x1, y0, y1), w, h)
       const metres = part(depth, width, x0, x1, y0, y1)
-      const out = await dof.render(light, metres, w, h, focus.nearM, (fNumber * w) / width)
+      const cover = matte && part(matte, width, x0, x1, y0, y1)
+      const out = await dof.render(light, metres, w, h, focus.nearM, (fNumber * w) / width, cover)
       const tile = srgbBytes(out)
       for (let y = top; y < Math.min(height, top + tilePx); y++) {
         const row = 4 * w * (y - y0)
