@@ -65,7 +65,7 @@ def blur(
         maps = [[None] * len(image) if t is None else t.expand(len(image), -1, -1, -1).split(1) for t in given]
         items = zip(*maps, strict=True)
         return torch.cat([blur(i, c, plan, options, tuple(b) or None, w, ops, a) for i, c, w, a, *b in items])
-    coc_px, covered = edges.mended(image, coc_px, options.depth_edges, ops), None
+    coc_px, covered = edges.mended(image, coc_px, options.depth_edges, ops, matte), None
     if matte is not None:
         coc_px, covered = covered_by(image, coc_px, matte, highlights.threshold, ops)
     whole = functools.partial(_planned, image, coc_px, behind=behind, ops=ops, covered=covered)

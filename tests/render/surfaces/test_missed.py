@@ -7,7 +7,8 @@ import torch
 
 from tests.scenes import TURNS, furry_post, pixels_from_post
 from torchdof import blur_by_coc, native
-from torchdof.render.surfaces import missed
+from torchdof.render.rules import without
+from torchdof.render.surfaces import edges, missed
 
 DAMAGED = torch.zeros(1, 1, 224, 160)  # stands for a map that the repair has changed
 COMPILED = pytest.mark.skipif(not native.chosen(), reason="the compiled engine is not built here")
@@ -56,6 +57,21 @@ def test_a_sharper_foreground_is_left_alone(engine: str) -> None:
     image, given, _ = furry_post()
     sharper = torch.where(given < 0, 0.0, 12.0)  # the focus is on the fur
     assert missed.completed(image, sharper, DAMAGED)[0].equal(sharper)
+
+
+def test_a_matte_tells_what_a_map_misses_at_its_edges(engine: str) -> None:
+    """There foregrounds neither grow nor blur their surroundings; those that the matte does not cover do."""
+    image, given, exact = (torch.cat([t, t], 2) for t in furry_post(noise=0.1))
+    matte = (exact < 0).float()
+    matte[:, :, 224:] = 0.0  # the lower post has none
+    with_matte, without_matte = (edges.mended(image, given, "auto", matte=m) for m in (matte, None))
+    with without(["missed_parts", "in_doubt"]):
+        repaired = edges.mended(image, given, "auto")
+    upper, lower = slice(0, 224), slice(224 + edges._MATTE_REACH + 1, None)
+    torch.testing.assert_close(with_matte[:, :, upper], repaired[:, :, upper], atol=5e-3, rtol=0)
+    assert with_matte[:, :, lower].equal(without_matte[:, :, lower])
+    is_blurred = (without_matte - repaired).abs() > 1.0
+    assert int(is_blurred[:, :, upper].sum()) > 1000 and int(is_blurred[:, :, lower].sum()) > 1000
 
 
 def test_items_of_a_batch_are_completed_independently(engine: str) -> None:

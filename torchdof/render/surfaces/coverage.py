@@ -26,7 +26,7 @@ from ..engines.ops import EAGER, Ops
 from ..layers.downsampling import downsampled, upsampled
 from .windows import highest
 
-__all__ = ["covered_by"]
+__all__ = ["covered_by", "is_near_edge"]
 
 _LEVELS = 6  # levels of the pyramid that finds samples of one surface; larger: from farther away
 _MANY = 64  # samples from which the means of a first guess come; larger: errors of the depth matter less
@@ -133,6 +133,11 @@ def _covered_by(
     return torch.where(known, moved, coc_px), torch.cat([share, other, weight, certainty], 1)
 
 
+def is_near_edge(matte: Tensor, reach_px: int) -> Tensor:
+    """Whether an edge of a matte ``[B, 1, H, W]`` is within so many pixels: its coverage rises by a half there."""
+    return _change(torch.nan_to_num(matte).clamp(0.0, 1.0), 2 * reach_px + 1) > 0.5
+
+
 def _place(coc_px: Tensor, subject: Tensor, beside: Tensor) -> Tensor:
     """Place of a coc between those of two surfaces: 1 at the subject's, 0 at that of its surroundings."""
     step = subject - beside
@@ -145,12 +150,15 @@ def _change(values: Tensor, side: int) -> Tensor:
 
 
 def _largest(values: Tensor, side: int) -> Tensor:
-    """Largest of the 3 x 3 or 9 x 9 pixels around; max_pool2d takes ten times as long on a CPU."""
+    """Largest of the ``side x side`` pixels around, side being odd; max_pool2d takes ten times as long on a CPU."""
     values = functional.pad(values, (side // 2,) * 4, value=-torch.inf)
     for dim in (-1, -2):
-        for step in (1, 1) if side == 3 else (1, 2, 4, 1):  # of windows of 1, 2, 4 and 8 pixels
+        width = 1  # of the windows whose largest value is known; two of them make a wider one
+        while width < side:
+            step = min(width, side - width)
             count = values.shape[dim] - step
             values = torch.maximum(values.narrow(dim, 0, count), values.narrow(dim, step, count))
+            width += step
     return values
 
 

@@ -26,6 +26,7 @@ from ...validation import ends
 from ..engines.ops import EAGER, Ops
 from ..engines.traced import is_compiled, one_operator
 from ..rules import active
+from .coverage import is_near_edge
 from .doubt import blurred_in_doubt, doubt_of
 from .missed import completed
 from .windows import highest, mean_around
@@ -108,6 +109,9 @@ _BETTER = 0.5  # fraction of the variance unexplained by a sharp shape that its 
 _RINGING_REACH = 3  # px; half the largest width of a rim of ringing; larger: wider details are flattened
 _OVERSHOOT = 0.12  # largest height of a rim that is removed in full, in steps; at twice this height it stays
 
+# With a matte
+_MATTE_REACH = 30  # px; distance from its edge up to which foregrounds neither grow nor blur their surroundings
+
 # Numbers
 _NEVER = 1e30  # negated, replaces invalid values in maxima
 _LARGEST = 1e15  # largest valid nearness, whose square is finite in float32
@@ -165,17 +169,20 @@ def repair_edges(image: Tensor, depth: Tensor, edges: DepthEdges = "repair") -> 
     return torch.where(changed, 1.0 / repaired.clamp_min(0.0), depth)
 
 
-def mended(image: Tensor, coc_px: Tensor, edges: DepthEdges, ops: Ops = EAGER) -> Tensor:
+def mended(
+    image: Tensor, coc_px: Tensor, edges: DepthEdges, ops: Ops = EAGER, matte: Tensor | None = None
+) -> Tensor:
     """Repairs the edges of a map of the coc: the first step of the pipeline.
 
     Pixels at edges get the surface that they show, blurred foregrounds get what the map misses of them, and edges that
-    are still in doubt are blurred.
+    are still in doubt are blurred. At edges of a matte, only the first of these steps: the matte tells what is missed.
 
     Args:
         image: ``[B, C, H, W]``, linear light.
         coc_px: ``[B or 1, 1, H, W]``, signed.
         edges: As for :func:`repair_edges`.
         ops: Skips frames without edges, and processes lists of pixels in parts.
+        matte: Coverage by the subject ``[B or 1, 1, H, W]``, in [0, 1].
 
     Returns:
         The map, ``[B, 1, H, W]`` if it is repaired. Gradients flow to unchanged pixels.
@@ -190,8 +197,11 @@ def mended(image: Tensor, coc_px: Tensor, edges: DepthEdges, ops: Ops = EAGER) -
     repaired, contradicted = repair(image, given, STEP_PX, auto=edges == "auto", of_coc=True, ops=ops)
     if repaired is given:
         return coc_px
-    repaired, missed = completed(image, repaired, given, ops)
-    repaired = blurred_in_doubt(given, repaired, torch.maximum(contradicted, missed), ops)
+    grown, missed = completed(image, repaired, given, ops)
+    blurred = blurred_in_doubt(given, grown, torch.maximum(contradicted, missed), ops)
+    if matte is not None:
+        blurred = torch.where(is_near_edge(matte.detach(), _MATTE_REACH), repaired, blurred)
+    repaired = blurred
     repaired = ops.equal_unless(lambda: _has_steps(coc_px), repaired, coc_px)
     return torch.where(repaired == coc_px, coc_px, repaired) if is_differentiated(coc_px) else repaired
 
