@@ -169,9 +169,7 @@ def repair_edges(image: Tensor, depth: Tensor, edges: DepthEdges = "repair") -> 
     return torch.where(changed, 1.0 / repaired.clamp_min(0.0), depth)
 
 
-def mended(
-    image: Tensor, coc_px: Tensor, edges: DepthEdges, ops: Ops = EAGER, matte: Tensor | None = None
-) -> Tensor:
+def mended(image: Tensor, coc_px: Tensor, edges: DepthEdges, ops: Ops = EAGER, matte: Tensor | None = None) -> Tensor:
     """Repairs the edges of a map of the coc: the first step of the pipeline.
 
     Pixels at edges get the surface that they show, blurred foregrounds get what the map misses of them, and edges that
