@@ -134,7 +134,7 @@ def _covered_by(
 
 
 def is_near_edge(matte: Tensor, reach_px: int) -> Tensor:
-    """Whether an edge of a matte ``[B, 1, H, W]`` is within so many pixels: its coverage rises by a half there."""
+    """Whether an edge of a matte ``[B, 1, H, W]`` is within a distance: its coverage rises by a half there."""
     return _change(torch.nan_to_num(matte).clamp(0.0, 1.0), 2 * reach_px + 1) > 0.5
 
 
