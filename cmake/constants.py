@@ -28,6 +28,9 @@ MODULES = (
 )
 """Modules whose constants C++ may read; a header and its namespace have the name of their module."""
 
+SINGLE = ("doubt", "edges", "missed")
+"""Modules whose C++ computes with single precision alone: their constants are ``float``, the others' ``double``."""
+
 Value = int | float | tuple[int | float, ...]
 
 _OPERATORS: dict[type[ast.AST], Any] = {
@@ -84,7 +87,8 @@ def headers() -> dict[str, str]:
     texts = {}
     for module in MODULES:
         name = module.removesuffix("/__init__").rpartition("/")[2]
-        texts[name] = _header(name, [_line(*item) for item in constants_of(module).items()])
+        real = "float" if name in SINGLE else "double"
+        texts[name] = _header(name, [_line(*item, real) for item in constants_of(module).items()])
     interface = (PACKAGE / "native" / "api.h").read_text(encoding="utf-8")
     checked = {"ALL": "".join(texts.values()), "INTERFACE": interface}
     lines = [f"constexpr uint32_t {name} = {zlib.crc32(text.encode())}u;" for name, text in checked.items()]
@@ -99,10 +103,10 @@ def _header(name: str, lines: list[str]) -> str:
     )
 
 
-def _line(name: str, value: Value) -> str:
-    """Definition of a constant; a tuple becomes an array."""
+def _line(name: str, value: Value, real: str) -> str:
+    """Definition of a constant, of type ``real`` if it is not whole; a tuple becomes an array."""
     items = value if isinstance(value, tuple) else (value,)
-    kind = "double" if any(isinstance(item, float) for item in items) else "int"
+    kind = real if any(isinstance(item, float) for item in items) else "int"
     if kind == "int" and max(map(abs, items)) >= 2**31:
         kind = "int64_t"
     shown = ", ".join(map(repr, items))

@@ -15,16 +15,7 @@
 namespace torchdof {
 namespace {
 
-// Constants of render/surfaces/doubt.py, which gives their meanings, units and effects.
-constexpr float MOVED_PX = constants::doubt::MOVED_PX;
-constexpr int REACH = constants::doubt::REACH;
-constexpr float OF_NEAR = constants::doubt::OF_NEAR;
-constexpr float LEAST_BLUR_PX = constants::doubt::LEAST_BLUR_PX;
-constexpr int AT_EDGE_PX = constants::doubt::AT_EDGE_PX;
-constexpr int EDGE_REACH = constants::doubt::EDGE_REACH;
-constexpr float LEAST_STEP_PX = constants::doubt::LEAST_STEP_PX;
-constexpr float LARGEST_PX = constants::doubt::LARGEST_PX;
-constexpr float NEVER = constants::doubt::NEVER;
+using namespace constants::doubt;  // render/surfaces/doubt.py gives meanings, units and effects
 
 constexpr int TILE = 96;  // px; side of the squares that a thread processes at once
 

@@ -22,72 +22,10 @@
 namespace torchdof {
 namespace {
 
-// Constants of render/surfaces/edges.py, which gives their meanings, units and effects.
-constexpr int RINGS = constants::edges::RINGS;
-constexpr int RAMP_REACH = constants::edges::RAMP_REACH;
-constexpr int FLAT_REACH = constants::edges::FLAT_REACH;
-constexpr int REACH = constants::edges::REACH;
-constexpr int NOISE_SAMPLED = constants::edges::NOISE_SAMPLED;
-constexpr int DIRECTIONS = constants::edges::DIRECTIONS;
-constexpr int LEVELS = constants::edges::LEVELS;
-constexpr int PLACES = constants::edges::PLACES;
-constexpr int SAMPLED = constants::edges::SAMPLED;
-constexpr int SAMPLE_BLOCK = constants::edges::BLOCK;
-constexpr int ROUNDS = constants::edges::ROUNDS;
-constexpr int BLUR_REACH = constants::edges::BLUR_REACH;
-constexpr int RINGING_REACH = constants::edges::RINGING_REACH;
-constexpr int USUAL_REACH = constants::edges::USUAL_REACH;
-constexpr int LAMP_REACH = constants::edges::LAMP_REACH;
-constexpr float ABRUPT = constants::edges::ABRUPT;
-constexpr float SHALLOW = constants::edges::SHALLOW;
-constexpr float TIE = constants::edges::TIE;
-constexpr float FLAT = constants::edges::FLAT;
-constexpr float NEAREST = constants::edges::NEAREST;
-constexpr float SPREAD = constants::edges::SPREAD;
-constexpr float CLEAR_LEVEL = constants::edges::CLEAR_LEVEL;
-constexpr float LEAST_BLUR_PX = constants::edges::LEAST_BLUR_PX;
-constexpr float MOST_BLUR_PX = constants::edges::MOST_BLUR_PX;
-constexpr float EXPLAINED = constants::edges::EXPLAINED;
-constexpr float EXPLAINED_MORE = constants::edges::EXPLAINED_MORE;
-constexpr float NOISES = constants::edges::NOISES;
-constexpr float NOISE_OF_BEND = constants::edges::NOISE_OF_BEND;
-constexpr float NOISE_OF_ROUNDING = constants::edges::NOISE_OF_ROUNDING;
-constexpr float LEVELS_OF_A_FILE = constants::edges::LEVELS_OF_A_FILE;
-constexpr float FALLOFF_PX = constants::edges::FALLOFF_PX;
-constexpr float CLEAR = constants::edges::CLEAR;
-constexpr float CLEAR_IN_PRIOR = constants::edges::CLEAR_IN_PRIOR;
-constexpr float LIKELY = constants::edges::LIKELY;
-constexpr float SHARPNESS = constants::edges::SHARPNESS, SOFT_SHARPNESS = constants::edges::SOFT_SHARPNESS;
-constexpr float COLOUR_NOISE = constants::edges::COLOUR_NOISE;
-constexpr float SIMILAR = constants::edges::SIMILAR;
-constexpr float TRUSTED = constants::edges::TRUSTED;
-constexpr float PRIOR_COUNT = constants::edges::PRIOR_COUNT;
-constexpr float RELATED = constants::edges::RELATED;
-constexpr float EXACT = constants::edges::EXACT;
-constexpr float DOUBTFUL = constants::edges::DOUBTFUL;
-constexpr float LEAN = constants::edges::LEAN;
-constexpr float MIXTURE = constants::edges::MIXTURE;
-constexpr float TO_BLURRED = constants::edges::TO_BLURRED;
-constexpr float MORE_BLURRED_PX = constants::edges::MORE_BLURRED_PX;
-constexpr float SOFT = constants::edges::SOFT;
-constexpr float WIDE = constants::edges::WIDE;
-constexpr float MIXED = constants::edges::MIXED;
-constexpr float BESIDE = constants::edges::BESIDE;
-constexpr float DIAGONAL = constants::edges::DIAGONAL;
-constexpr int DECIDED_ROUNDS = constants::edges::DECIDED_ROUNDS;
-constexpr float CLIMBED = constants::edges::CLIMBED;
-constexpr float PIXEL = constants::edges::PIXEL;
-constexpr float BETTER = constants::edges::BETTER;
-constexpr float OVERSHOOT = constants::edges::OVERSHOOT;
-constexpr float NONE = constants::edges::NEVER;
-constexpr float LARGEST = constants::edges::LARGEST;
-constexpr float BRIGHTEST = constants::edges::BRIGHTEST;
-constexpr int KINDS = DIRECTIONS * PLACES;
-
-// Those of render/surfaces/doubt.py.
-constexpr float CONTRADICTED = constants::doubt::CONTRADICTED;
-constexpr float OFTEN_CONTRADICTED = constants::doubt::OFTEN_CONTRADICTED;
-constexpr float ASSUMED = constants::doubt::ASSUMED;
+// Python gives the meanings, units and effects of these constants.
+using namespace constants::edges;
+using constants::doubt::ASSUMED, constants::doubt::CONTRADICTED, constants::doubt::OFTEN_CONTRADICTED;
+constexpr int SAMPLE_BLOCK = BLOCK, KINDS = DIRECTIONS * PLACES;
 
 constexpr int AREA = 96;  // side of a tile in pixels
 // A pixel's result depends on the pixels within this many of it: without ramps, and with ramps.
@@ -103,9 +41,7 @@ static_assert(SIDE - WHOLE <= 4 && WHOLE > REACH + 1);
 // Bits of a pixel's mark. NEAR: the map gives it the near surface's depth. Bits from UNSURE up: index into SURE.
 constexpr uint8_t EDGE = 1, RAMP = 2, NEAR = 4, LISTED = 8, UNSURE = 32;
 // weight as a colour reference: far from steps, RINGS pixels from one, ..., beside one; 0 for invalid pixels and ramps
-using constants::edges::SURE;
-constexpr float SURE_OF[256 / UNSURE] = {(float)SURE[4], (float)SURE[3], (float)SURE[2], (float)SURE[1],
-                                         (float)SURE[0]};
+constexpr float SURE_OF[256 / UNSURE] = {SURE[4], SURE[3], SURE[2], SURE[1], SURE[0]};
 
 // A pixel whose surface is to be decided.
 struct Edge {
@@ -451,7 +387,7 @@ class Repair : Frame {
     const Part around = in_frame(part.grown(STEP_HALO));
     float least_step = step(0);
     if (map_.steps) {
-      least_step = NONE;
+      least_step = NEVER;
       for (int y = around.y0; y < around.bottom(); y++)
         for (int x = around.x0; x < around.right(); x++)
           least_step = std::min(least_step, step((size_t)y * width_ + x));
@@ -520,8 +456,8 @@ class Repair : Frame {
     each_vector(m.raw, [&](int y, int x) {
       const vec v = load<vec>(m.raw.at(y, x));
       const auto is_valid = abs(v) <= LARGEST;
-      store(m.up.at(y, x), is_valid ? v : broadcast(-NONE));
-      store(m.down.at(y, x), is_valid ? -v : broadcast(-NONE));
+      store(m.up.at(y, x), is_valid ? v : broadcast(-NEVER));
+      store(m.down.at(y, x), is_valid ? -v : broadcast(-NEVER));
     });
     slopes(m.raw, m.slope, m.jump, m.is_wide ? m.ramps.grown(FLAT_REACH + 2) : m.beside);
     if (!find_ramps(m)) return false;
@@ -1114,10 +1050,10 @@ class Repair : Frame {
         clamp_to_frame(values, over);
         if (negated) each_vector(over, [&](int y, int x) { store(values.at(y, x), -load<vec>(values.at(y, x))); });
       };
-      fetch(evidence_.data(), up, [this](float v) { return std::fabs(v) <= LARGEST ? sign_ * v : -NONE; });
-      fetch(evidence_.data(), down, [this](float v) { return std::fabs(v) <= LARGEST ? -sign_ * v : -NONE; });
+      fetch(evidence_.data(), up, [this](float v) { return std::fabs(v) <= LARGEST ? sign_ * v : -NEVER; });
+      fetch(evidence_.data(), down, [this](float v) { return std::fabs(v) <= LARGEST ? -sign_ * v : -NEVER; });
       for (const Grid *values : {&up, &down}) spread(*values, 3, true);
-      vec widest = broadcast(-NONE);
+      vec widest = broadcast(-NEVER);
       each_vector(part, [&](int y, int x) {
         const vec here = -load<vec>(up.at(y, x)) - load<vec>(down.at(y, x));
         store(span.at(y, x), here);
@@ -1197,7 +1133,7 @@ class Repair : Frame {
       const Part &inner = all_parts[g].part, part = in_frame(inner.grown(LAMP_REACH));
       const Grid near(part.grown(REACH));
       fetch(map_.nearness, near, [this](float v) { return sign_ * valid(v); });
-      vec high = broadcast(-NONE), low = broadcast(NONE);
+      vec high = broadcast(-NEVER), low = broadcast(NEVER);
       each_vector(near, [&](int y, int x) {
         high = max(high, load<vec>(near.at(y, x)));
         low = min(low, load<vec>(near.at(y, x)));

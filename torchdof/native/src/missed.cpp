@@ -17,28 +17,7 @@
 namespace torchdof {
 namespace {
 
-// Constants of render/surfaces/missed.py, which gives their meanings, units and effects.
-using constants::missed::RINGS_PX;
-constexpr int RIM = constants::missed::RIM;
-constexpr int SAMPLED = constants::missed::SAMPLED;
-constexpr int CELL = constants::missed::CELL;
-constexpr int NEARBY = constants::missed::NEARBY;
-constexpr int GROWTH_STEP_PX = constants::missed::GROWTH_STEP_PX;
-constexpr int GROWTH_PX = constants::missed::GROWTH_PX;
-constexpr float GROWTH_OVER_SMOOTH_PX = constants::missed::GROWTH_OVER_SMOOTH_PX;
-constexpr float GRAIN = constants::missed::GRAIN;
-constexpr float SMOOTH = constants::missed::SMOOTH;
-constexpr float OUTLIER = constants::missed::OUTLIER;
-constexpr float UNLIKE = constants::missed::UNLIKE;
-constexpr float MOST_UNLIKE = constants::missed::MOST_UNLIKE;
-constexpr float MISSED = constants::missed::MISSED;
-constexpr float MANY_MISSED = constants::missed::MANY_MISSED;
-constexpr float COUNTED = constants::missed::COUNTED;
-constexpr float ON_SURFACE = constants::missed::ON_SURFACE;
-constexpr float LEAST_SAMPLES = constants::missed::LEAST_SAMPLES;
-constexpr float FAR_PX = constants::missed::FAR_PX;
-constexpr float LARGEST_PX = constants::missed::LARGEST_PX;
-constexpr float BRIGHTEST = constants::missed::BRIGHTEST;
+using namespace constants::missed;  // render/surfaces/missed.py gives meanings, units and effects
 
 constexpr int TILE = 128;                // px; side of the squares that a thread processes at once
 constexpr int MARGIN = 32;               // px around it in which rings are found, too
@@ -371,7 +350,7 @@ class Missed {
   static float missed(const Counts &counts) {
     const auto &[rim, background] = counts;
     const double excess = (rim.share() - background.share()) / std::max(1.0 - background.share(), 0.1);
-    const float share = (float)(excess * rim.all / (rim.all + COUNTED));
+    const float share = (float)(excess * rim.all / (rim.all + constants::missed::COUNTED));
     return clamp01((share - MISSED) / (MANY_MISSED - MISSED));
   }
 

@@ -16,8 +16,7 @@ namespace torchdof {
 // Constants of Python modules, which give their meanings, units and effects; here with the type of the computations.
 constexpr float KNOWN = constants::composite::KNOWN;
 constexpr float SAME_BLUR = constants::matting::SAME_BLUR;
-constexpr float SHARPER = constants::doubt::SHARPER;
-constexpr float APART_PX = constants::doubt::APART_PX;
+using constants::doubt::APART_PX, constants::doubt::SHARPER;
 constexpr float BEHIND_PX = constants::disocclusion::BEHIND_PX;
 constexpr float OWN_SLOPE = constants::disocclusion::OWN_SLOPE;
 constexpr float FOOT = constants::layer_weights::FOOT;
