@@ -23,7 +23,7 @@ from torchdof.render.layers.plan import Plan
 
 CAMERA = torchdof.Camera.from_fov(50.0, 0.05, 2.0)
 SMALL = torchdof.Camera(sensor_width_mm=4.0)  # 4 px at infinity in the hard cases' small frames
-GIVEN: dict[str, Any] = {"depth_edges": "as given"}  # the default of an exported file
+GIVEN: dict[str, Any] = {"depth_edges": "as given"}  # files without the repair are written sooner
 MODULES: dict[str, Callable[[], torchdof.DepthOfField]] = {
     # with occlusion, at resolutions down to an eighth; slow to trace
     "layered": lambda: torchdof.DepthOfField(SMALL, **GIVEN, tolerance=64 / 255, max_coc_px=8.0, check=False),

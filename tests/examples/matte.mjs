@@ -4,14 +4,15 @@ import { readFileSync, readdirSync } from 'node:fs'
 import { join, resolve } from 'node:path'
 import { pathToFileURL } from 'node:url'
 
-const { coverageAtSize, readCoverage } = await import(pathToFileURL(resolve('examples/embed/javascript/matte.mjs')).href)
+const { decodePng } = await import(pathToFileURL(resolve('examples/embed/javascript/png.mjs')).href)
+const { coverageAtSize, coverageOf } = await import(pathToFileURL(resolve('examples/embed/javascript/matte.mjs')).href)
 const { DepthOfField } = await import(pathToFileURL(resolve('examples/embed/javascript/depth_of_field.mjs')).href)
 
 const folder = process.argv[2]
 const results = {}
 for (const name of readdirSync(folder).filter((name) => name.endsWith('.png'))) {
   try {
-    const mask = await readCoverage(readFileSync(join(folder, name)))
+    const mask = coverageOf(await decodePng(readFileSync(join(folder, name))))
     const sizes = [[mask.width, mask.height], [5, 4], [37, 23]]
     results[name] = sizes.map(([width, height]) => ({ width, height, values: [...coverageAtSize(mask, width, height)] }))
   } catch (error) {

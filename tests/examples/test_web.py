@@ -151,4 +151,5 @@ def test_a_mask_of_the_subject_is_rendered_with_its_photograph_alone(used: Any) 
     rows = np.reshape(values, (height, width))
     assert rows[:, 0].max() < 0.05 and rows[:, -1].min() > 0.95, "white is the subject"
     assert "its mask 60 × 60: it must have the shape of the photo" in seen["problems"]["matte"]
+    assert seen["photoOfPair"] == "choose or drop a file"
     assert seen["matteLeftOut"].startswith("optional") and seen["matteOfSample"].startswith("optional")

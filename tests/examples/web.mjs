@@ -208,6 +208,18 @@ try {
   await page.waitForFunction(() => document.querySelector('[data-slot=photo] small').textContent === 'motorcycle.png')
   results.matteOfSample = await text('[data-slot=matte] small')
   await done()
+  // Depth and mask without their photograph do not belong to the sample's.
+  const pair = await page.evaluateHandle(([depth, mask]) => {
+    const transfer = new DataTransfer()
+    transfer.items.add(new File([new Uint8Array(depth)], 'b_depth.png', { type: 'image/png' }))
+    transfer.items.add(new File([new Uint8Array(mask)], 'b_mask.png', { type: 'image/png' }))
+    return transfer
+  }, [[...(await picture(90, 60, ['#fff', '#000']))], [...mask]])
+  await page.dispatchEvent('#frame', 'drop', { dataTransfer: pair })
+  await page.waitForFunction(() => document.querySelector('[data-slot=matte] small').textContent === 'b_mask.png')
+  results.photoOfPair = await text('[data-slot=photo] small')
+  await page.click('#sample')
+  await done()
   for (const [name, width, height, colorScheme] of [
     ['desktop_light', 1280, 860, 'light'],
     ['desktop_dark', 1280, 860, 'dark'],

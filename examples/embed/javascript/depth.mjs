@@ -150,17 +150,24 @@ export async function readDepthMap(bytes) {
 
 /** A depth map from a PNG with equal colour channels; the alpha of two or four channels is ignored. */
 export function greyDepthMap(samples, width, height, channels, fullScale) {
-  const values = new Float32Array(width * height)
-  for (let i = 0; i < values.length; i++) {
-    const at = i * channels
-    values[i] = samples[at]
-    if (channels > 2 && (Math.abs(samples[at + 1] - samples[at]) > 8 || Math.abs(samples[at + 2] - samples[at]) > 8)) {
-      throw new Error(
-        'the depth map is in colour. Colours are made for eyes: save the depth itself, as shades of grey, and load that.',
-      )
-    }
+  const values = greyValues(samples, width * height, channels)
+  if (values === null) {
+    throw new Error(
+      'the depth map is in colour. Colours are made for eyes: save the depth itself, as shades of grey, and load that.',
+    )
   }
   return new DepthMap(values, width, height, fullScale)
+}
+
+/** The shades of grey of an image, or null if its colour channels differ; alpha is ignored. */
+export function greyValues(samples, count, channels) {
+  const values = new Float32Array(count)
+  for (let i = 0; i < count; i++) {
+    const at = i * channels
+    values[i] = samples[at]
+    if (channels > 2 && (Math.abs(samples[at + 1] - samples[at]) > 8 || Math.abs(samples[at + 2] - samples[at]) > 8)) return null
+  }
+  return values
 }
 
 const NPY_TYPES = {

@@ -1,35 +1,23 @@
 // Masks of a subject: coverage, 0 to 1.
 
-import { decodePng, isPng } from './png.mjs'
-
-const EQUAL = 8 // largest difference between codes of a grey pixel
+import { greyValues } from './depth.mjs'
 
 /**
- * The coverage that a PNG states: by its transparency if it has any, else by its shades of grey.
+ * The coverage that an image states: by its transparency if it has any, else by its shades of grey.
  *
- * @param {Uint8Array} bytes
- * @param pixelsOf Decodes another file to {rgba, width, height}.
- * @returns {Promise<{values: Float32Array, width, height}>}
+ * @param image {samples, width, height, channels, bits}, as decodePng returns it.
+ * @returns {{values: Float32Array, width, height}}
  */
-export async function readCoverage(bytes, pixelsOf) {
-  const ofBrowser = async () => {
-    const { rgba, width, height } = await pixelsOf()
-    return { samples: rgba, width, height, channels: 4, bits: 8 }
+export function coverageOf({ samples, width, height, channels, bits }) {
+  const fullScale = 2 ** bits - 1
+  const alpha = channels % 2 === 0 && Float32Array.from({ length: width * height }, (_, i) => samples[(i + 1) * channels - 1])
+  const isTransparent = alpha && alpha.some((value) => value < fullScale)
+  const values = isTransparent ? alpha : greyValues(samples, width * height, channels)
+  if (values === null) {
+    throw new Error('the mask is in colour. Save it as shades of grey, white where the subject is, or as transparency.')
   }
-  const { samples, width, height, channels, bits } = isPng(bytes) ? await decodePng(bytes) : await ofBrowser()
-  const [alpha, count, most] = [channels - 1, width * height, 2 ** bits - 1]
-  const hasAlpha = channels % 2 === 0 && samples.some((value, i) => i % channels === alpha && value < most)
-  const isOfBits = !hasAlpha && samples.every((value, i) => value <= 1 || (channels % 2 === 0 && i % channels === alpha))
-  const fullScale = isOfBits ? 1 : most // programs also write 0 and 1
-  const values = new Float32Array(count)
-  for (let i = 0; i < count; i++) {
-    const [red, green, blue] = [0, 1, 2].map((c) => samples[i * channels + c])
-    if (!hasAlpha && channels > 2 && Math.max(Math.abs(green - red), Math.abs(blue - red)) > EQUAL) {
-      throw new Error('the mask is in colour. Save it as shades of grey, white where the subject is, or as transparency.')
-    }
-    values[i] = (hasAlpha ? samples[i * channels + alpha] : red) / fullScale
-  }
-  return { values, width, height }
+  const most = !isTransparent && values.every((value) => value <= 1) ? 1 : fullScale // programs also write 0 and 1
+  return { values: values.map((value) => value / most), width, height }
 }
 
 /** Coverage at another size: each new pixel is a mean weighted by a triangle, as wide as two old or two new pixels. */

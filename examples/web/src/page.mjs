@@ -78,7 +78,7 @@ async function take(files, slot = null) {
       opened[kind] = await { photo: readPhoto, depth: readDepth, matte: readMatte }[kind](file)
     }
     // depth and mask of the photo that goes; not those that were chosen while the new photo was read
-    const isOther = (isSample && !opened.matte) || (opened.photo && photo)
+    const isOther = isSample ? opened.photo || opened.depth : opened.photo && photo
     if (isOther && depthFile === earlier.depthFile) depthFile = null
     if (isOther && matteFile === earlier.matteFile) matteFile = null
     if (isSample && isOther) photo = null

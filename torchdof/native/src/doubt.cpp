@@ -39,7 +39,7 @@ class Blur : Frame {
   void blur(const Part &part) const {
     const Part beside = part.grown(REACH), whole = beside.grown(REACH);
     const Grid nearness(whole), moved(whole), rows(whole);
-    const auto near_of = [](float coc) { return std::fabs(coc) <= LARGEST_PX ? -coc : NEVER; };
+    const auto near_of = [](float coc) { return std::fabs(coc) <= LARGEST ? -coc : -NEVER; };
     fetch(given_, moved, near_of);
     fetch(repaired_, nearness, near_of);
     vec any{};
@@ -64,7 +64,7 @@ class Blur : Frame {
     const Grid farness(around), high(part), low(part), edge(at_edge), fading(part);
     each_vector(around, [&](int y, int x) {
       const vec own = load<vec>(nearness.at(y, x));
-      store(farness.at(y, x), own > NEVER ? -own : own);
+      store(farness.at(y, x), own > -NEVER ? -own : own);
     });
     max_filter<EDGE_REACH>(nearness, high, rows, part);
     max_filter<EDGE_REACH>(farness, low, rows, part);

@@ -25,6 +25,7 @@ namespace {
 // Python gives the meanings, units and effects of these constants.
 using namespace constants::edges;
 using constants::doubt::ASSUMED, constants::doubt::CONTRADICTED, constants::doubt::OFTEN_CONTRADICTED;
+using constants::doubt::LARGEST, constants::doubt::NEVER;
 constexpr int SAMPLE_BLOCK = BLOCK, KINDS = DIRECTIONS * PLACES;
 
 constexpr int AREA = 96;  // side of a tile in pixels

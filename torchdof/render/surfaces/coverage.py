@@ -71,18 +71,17 @@ def covered_by(
 
     if not is_traced() and not has_edge():
         return coc_px, None
-    moved, others = _covered_by(image, coc_px, matte, threshold)
-    items, channels, height, width = image.shape
-    uncovered = torch.zeros_like(image[:, :1], dtype=moved.dtype).expand(-1, channels + 3, -1, -1)
-    none = torch.cat([coc_px.to(moved.dtype).expand(items, -1, height, width), uncovered], 1)
-    moved, others = ops.equal_unless(has_edge, torch.cat([moved, others], 1), none).split([1, channels + 3], 1)
-    return moved, others
+    covered = _covered_by(image, coc_px, matte, threshold)
+    if is_traced():
+        items, channels, height, width = image.shape
+        others = torch.zeros_like(image[:, :1], dtype=covered.dtype).expand(-1, channels + 3, -1, -1)
+        none = torch.cat([coc_px.to(covered.dtype).expand(items, -1, height, width), others], 1)
+        covered = ops.equal_unless(has_edge, covered, none)
+    return covered[:, :1], covered[:, 1:]
 
 
-def _covered_by(
-    image: Tensor, coc_px: Tensor, matte: Tensor, threshold: Callable[[Tensor, Tensor], Tensor]
-) -> tuple[Tensor, Tensor]:
-    """:func:`covered_by` of a matte that has an edge."""
+def _covered_by(image: Tensor, coc_px: Tensor, matte: Tensor, threshold: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+    """:func:`covered_by` of a matte that has an edge: the map and the other surfaces, ``[B, C + 4, H, W]``."""
     wide = torch.promote_types(torch.promote_types(image.dtype, coc_px.dtype), torch.float32)
     light, (coc, cover) = image.to(wide), (t.to(wide).expand(image.shape[0], -1, -1, -1) for t in (coc_px, matte))
     known = torch.isfinite(coc) & torch.isfinite(light).all(1, keepdim=True)
@@ -130,7 +129,7 @@ def _covered_by(
     share = torch.where(light > 0, behind / torch.where(light > 0, light, 1.0), parts[1]).clamp(0.0, 1.0)
     share = torch.where(is_subject, share, 1.0 - share)
     weight = torch.where(is_subject, parts[1], parts[0])
-    return torch.where(known, moved, coc_px), torch.cat([share, other, weight, certainty], 1)
+    return torch.cat([torch.where(known, moved, coc_px), share, other, weight, certainty], 1)
 
 
 def is_near_edge(matte: Tensor, reach_px: int) -> Tensor:

@@ -16,7 +16,7 @@ from ..engines.ops import EAGER, Ops
 from ..rules import active
 from .windows import highest, mean_around
 
-__all__ = ["blurred_in_doubt", "doubt_of", "is_beyond"]
+__all__ = ["LARGEST", "NEVER", "blurred_in_doubt", "doubt_of", "is_beyond"]
 
 _CONTRADICTED = 0.03  # share of clear pixels that contradict the map, on either side, from which it is in doubt
 _OFTEN_CONTRADICTED = 0.045  # the same from which it is fully in doubt
@@ -30,8 +30,10 @@ _EDGE_REACH = 3  # px; distance at which surfaces on both sides of an edge are f
 _LEAST_STEP_PX = 3.0  # px; smallest difference in coc of the two surfaces of an edge
 _SHARPER = 0.7  # largest blur of a pixel beyond an edge, over that of the near surface; larger: edges within slopes
 _APART_PX = 2.0  # px; subtracted from it; larger: fewer edges
-_LARGEST_PX = 1e15  # px; largest valid coc
-_NEVER = -1e30  # nearness of invalid pixels
+
+# Numbers, also of the repair of edges
+LARGEST = 1e15  # largest valid nearness or coc, whose square is finite in float32
+NEVER = 1e30  # negated, replaces invalid nearness in maxima
 
 
 def is_beyond(blur_px: Tensor, near_px: Tensor) -> Tensor:
@@ -85,14 +87,14 @@ def blurred_in_doubt(given: Tensor, repaired: Tensor, doubt: Tensor, ops: Ops = 
 def _blurred(given: Tensor, repaired: Tensor, doubt: Tensor) -> Tensor:
     """:func:`blurred_in_doubt` by PyTorch, for float32."""
     moved = ((repaired - given).abs() > _MOVED_PX).to(repaired.dtype)
-    valid = repaired.abs() <= _LARGEST_PX
-    nearness = torch.where(valid, -repaired, _NEVER)
+    valid = repaired.abs() <= LARGEST
+    nearness = torch.where(valid, -repaired, -NEVER)
     near = highest(nearness, _REACH)
     is_near = (nearness > 0.5 * near.clamp_min(1.0)).to(nearness.dtype)
     is_beside = is_beyond(nearness.abs(), near) & (highest(moved, _REACH) > 0)
     beside = torch.where(is_beside, _OF_NEAR * near * (2.0 * mean_around(is_near, _REACH)).clamp(max=1.0), 0.0)
 
-    step = highest(nearness, _EDGE_REACH) + highest(torch.where(valid, -nearness, _NEVER), _EDGE_REACH)
+    step = highest(nearness, _EDGE_REACH) + highest(torch.where(valid, -nearness, -NEVER), _EDGE_REACH)
     at_edge = torch.where(step > _LEAST_STEP_PX, _LEAST_BLUR_PX * mean_around(highest(moved, 1), _AT_EDGE_PX), 0.0)
     least = doubt * torch.maximum(beside, at_edge)
     is_sharper = valid & (nearness.abs() < least)

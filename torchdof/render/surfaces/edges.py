@@ -27,7 +27,7 @@ from ..engines.ops import EAGER, Ops
 from ..engines.traced import is_compiled, one_operator
 from ..rules import active
 from .coverage import is_near_edge
-from .doubt import blurred_in_doubt, doubt_of
+from .doubt import LARGEST, NEVER, blurred_in_doubt, doubt_of
 from .missed import completed
 from .windows import highest, mean_around
 
@@ -113,8 +113,6 @@ _OVERSHOOT = 0.12  # largest height of a rim that is removed in full, in steps; 
 _MATTE_REACH = 30  # px; distance from its edge up to which foregrounds neither grow nor blur their surroundings
 
 # Numbers
-_NEVER = 1e30  # negated, replaces invalid values in maxima
-_LARGEST = 1e15  # largest valid nearness, whose square is finite in float32
 _BRIGHTEST = 1e30  # upper limit for light; products of a few such values overflow float32
 
 
@@ -173,7 +171,7 @@ def mended(image: Tensor, coc_px: Tensor, edges: DepthEdges, ops: Ops = EAGER, m
     """Repairs the edges of a map of the coc: the first step of the pipeline.
 
     Pixels at edges get the surface that they show, blurred foregrounds get what the map misses of them, and edges that
-    are still in doubt are blurred. At edges of a matte, only the first of these steps: the matte tells what is missed.
+    are still in doubt are blurred. Near edges of a matte only the first step is done: a matte states coverage.
 
     Args:
         image: ``[B, C, H, W]``, linear light.
@@ -197,9 +195,10 @@ def mended(image: Tensor, coc_px: Tensor, edges: DepthEdges, ops: Ops = EAGER, m
         return coc_px
     grown, missed = completed(image, repaired, given, ops)
     blurred = blurred_in_doubt(given, grown, torch.maximum(contradicted, missed), ops)
-    if matte is not None:
-        blurred = torch.where(is_near_edge(matte.detach(), _MATTE_REACH), repaired, blurred)
-    repaired = blurred
+    if matte is None:
+        repaired = blurred
+    else:
+        repaired = torch.where(is_near_edge(matte.detach(), _MATTE_REACH), repaired, blurred)
     repaired = ops.equal_unless(lambda: _has_steps(coc_px), repaired, coc_px)
     return torch.where(repaired == coc_px, coc_px, repaired) if is_differentiated(coc_px) else repaired
 
@@ -268,7 +267,7 @@ def judged(image: Tensor, coc_px: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         Whether a pixel is at an edge, whether it is on a ramp there, and the repaired map, ``[B, 1, H, W]`` each.
     """
     nearness = -coc_px.float().expand(image.shape[0], -1, -1, -1)
-    valid = nearness.abs() <= _LARGEST
+    valid = nearness.abs() <= LARGEST
     step = (_NOISES * _noise(nearness, valid)).clamp_min(STEP_PX)
     edges = _find(torch.where(valid, nearness, 0.0), valid, step)
     return edges.is_edge, edges.is_edge & edges.is_ramp, mended(image, coc_px, "auto")
@@ -293,7 +292,7 @@ def _repair(
     rules = active()
     if of_coc:
         nearness = -nearness
-    valid = nearness.abs() <= _LARGEST
+    valid = nearness.abs() <= LARGEST
     given = torch.where(valid, nearness, 0.0)
     step = torch.maximum(step, _NOISES * _noise(given, valid))
     light = torch.where(torch.isfinite(image), image, 0.0).clamp(0.0, _BRIGHTEST)
@@ -489,7 +488,7 @@ def _find(nearness: Tensor, valid: Tensor, step: Tensor) -> _Edges:
 
 def _ends(nearness: Tensor, valid: Tensor) -> Tensor:
     """A map and its negative, ``[B, 2, H, W]``, so that maxima of both are the ends of its range."""
-    return torch.where(valid, torch.cat([nearness, -nearness], 1), -_NEVER)
+    return torch.where(valid, torch.cat([nearness, -nearness], 1), -NEVER)
 
 
 def _kind(edges: _Edges) -> Tensor:
