@@ -298,6 +298,38 @@ def test_the_direction_of_an_edge_does_not_depend_on_rounding(moved: float) -> N
     assert torch.equal(found.direction[found.is_edge], again.direction[found.is_edge])
 
 
+def levels_of_a_file(count: int) -> Tensor:
+    """Hills of whole numbers up to a count: differences and means of neighbours are simple fractions of each other."""
+    hills = torch.rand(1, 1, 16, 24, generator=torch.Generator().manual_seed(0))
+    return count * functional.interpolate(hills, size=(96, 144), mode="bicubic")
+
+
+@pytest.mark.parametrize("moved", [0.1, -7.0])
+@pytest.mark.parametrize("count", [40, 120])
+def test_edges_between_levels_of_a_file_do_not_depend_on_rounding(count: int, moved: float) -> None:
+    levels = levels_of_a_file(count).round()
+    found, again = (
+        edges._find(n, n.isfinite(), step)
+        for n, step in ((levels, torch.tensor(1.0)), (levels / 3 + moved, torch.tensor(1 / 3)))
+    )
+    assert int(found.is_ramp.sum()) > 1000
+    for name in ("is_edge", "is_ramp", "ring"):
+        assert torch.equal(getattr(found, name), getattr(again, name)), name
+
+
+@COMPILED
+@pytest.mark.parametrize("of_coc", [True, False])
+@pytest.mark.parametrize("count", [16, 40, 255])
+def test_engines_agree_at_every_pixel_of_a_map_of_levels(count: int, of_coc: bool) -> None:
+    levels = levels_of_a_file(count).round()
+    light = levels / count + 0.2 * torch.rand(1, 3, 96, 144)
+    given = (-1.0 if of_coc else 1.0) * (0.3 * levels - 7.0)
+    plain = edges._repair(light, given, torch.tensor(1.0), False, of_coc)[0]
+    fast, _ = edges.repair(light, given, torch.tensor(1.0), False, of_coc)
+    assert float((fast != given).float().mean()) > 0.5
+    torch.testing.assert_close(fast, plain, rtol=0, atol=1e-3)
+
+
 def test_infinite_depth_is_a_surface(scene: Scene) -> None:
     depth = torch.where(scene.depth == 6.0, math.inf, scene.depth)
     given = degrade(depth, "near -1px")

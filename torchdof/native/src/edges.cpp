@@ -759,7 +759,7 @@ class Repair : Frame {
       const int lane = (int)(k % LANES);
       Window &window = windows.of_pixel[lane];
       const float near = edge.near, far = edge.far;
-      const vec most_difference = broadcast(0.25f * std::max(near - far, 1e-12f));
+      const vec most_difference = broadcast(SAMPLED_GAP * std::max(near - far, 1e-12f));
       vec few[C ? 4 + 2 * C : 1];
       // of both surfaces: weights, squared colour differences, colour differences of each channel
       vec *sums = C ? few : many.data();

@@ -36,17 +36,18 @@ __all__ = ["STEP_PX", "judged", "mended", "repair", "repair_edges"]
 STEP_PX = 1.0
 """Smallest difference in coc, in pixels, between two surfaces whose edge is repaired."""
 
-# Edges: which pixels are compared
+# Edges: which pixels are compared. Steps, slopes and means of a map with the levels of a file are simple fractions of
+# each other. Rounding would decide where they meet such a limit, so these limits are none: 0.3037 instead of 0.3.
 _LEAST_STEP_PX = 0.5 * STEP_PX  # smallest range of coc in a map that is repaired; half a step, as for lamps
 _STEP = 0.1  # step of :func:`repair_edges`, as a fraction of the largest nearness around; larger: fewer edges
 _RINGS = 3  # px on each side of a step that are checked; larger: corrects wider displacements
-_ABRUPT = 0.3  # smallest jump between neighbours at a step, as a fraction of the step; larger: fewer steps
+_ABRUPT = 0.3037  # smallest jump between neighbours at a step, as a fraction of the step; larger: fewer steps
 _FLAT_REACH = 8  # px within which a ramp becomes flat; larger: more slopes count as ramps
 _RAMP_REACH = 6  # px; half the width of the widest ramp, anything wider is a slope
-_SHALLOW = 0.03  # smallest slope of a ramp per pixel, as a fraction of the range of nearness around
-_FLAT = 0.3  # slope of the flattest place around a ramp, over the ramp's; larger: more slopes count as ramps
-_NEAREST = 0.6  # a step nearer to the pixel counts from this part of the largest one around; larger: fewer rings
-_TIE = 0.017  # steps by which one axis must lead to give an edge its direction; breaks ties of means over 25 pixels
+_SHALLOW = 0.0303  # smallest slope of a ramp per pixel, as a fraction of the range of nearness around
+_FLAT = 0.3037  # slope of the flattest place around a ramp, over the ramp's; larger: more slopes count as ramps
+_NEAREST = 0.6037  # a step nearer to the pixel counts from this part of the largest one around; larger: fewer rings
+_TIE = 0.0171  # steps by which one axis must lead to give an edge its direction; larger: more diagonal ones
 
 # Noise of a map, below which a step is not an edge
 _NOISE_OF_BEND = 0.6053  # 1.4826 / sqrt(6): deviation of Gaussian noise over the median of |second difference|
@@ -57,6 +58,7 @@ _NOISE_SAMPLED = 2**13  # pixels per frame that are sampled, half along rows and
 
 # Colour: which of two surfaces a pixel resembles
 _REACH = 5  # px; half the width of the window of samples around a pixel
+_SAMPLED_GAP = 0.2537  # a sample shows a surface up to this part of the step from it; larger: more samples
 _FALLOFF_PX = 2.5  # standard deviation of the Gaussian weights of these samples
 _SURE = (0.0, 0.02, 0.06, 0.2, 1.0)  # weight of a sample, by ring: beside a step its depth may be wrong
 _CLEAR = 0.1  # sum of these weights from which samples beside a step count in full; larger: thin strands stay
@@ -535,7 +537,7 @@ def _judge(
         others, values, trusted = samples[:-2], samples[-2], samples[-1]  # [C, n, P], [n, P]
         own = pixels.pick(looks, part)
         ends, is_ramp = own[-3:-1], own[-1]  # near and far, [2, P]
-        most_off = 0.25 * (ends[0] - ends[1]).clamp_min(1e-12)
+        most_off = _SAMPLED_GAP * (ends[0] - ends[1]).clamp_min(1e-12)
         side = falloff * trusted * ((values - ends[:, None]).abs() < most_off)  # [2, n, P]
 
         # mean colours of both surfaces, and the variance around them
