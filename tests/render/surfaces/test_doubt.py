@@ -106,3 +106,14 @@ def test_full_doubt_blurs_beside_a_foreground_by_a_share_of_its_blur_that_fades(
     expected = torch.tensor([2 * k / 17 * 8.0 for k in range(8, 0, -1)])  # k of 17 columns are those of the foreground
     assert_close(blurred[20:28], expected)
     assert_close(blurred[28:], given[0, 0, 4, 28:])
+
+
+def test_a_small_change_of_a_map_in_doubt_has_a_small_effect(engine: str) -> None:
+    dice = torch.Generator().manual_seed(0)
+    given = -12.0 * torch.rand(1, 1, 192, 288, generator=dice) - 0.1
+    given = torch.where(torch.arange(288) % 48 < 24, given, 0.1 * given)  # columns of blurred and of sharp pixels
+    moved = given - 2.0 * (torch.rand(given.shape, generator=dice) - 0.97).clamp_min(0.0) / 0.03
+    nearby = moved + 1e-3 * (torch.rand(moved.shape, generator=dice) - 0.5)
+    blurred, again = (blurred_in_doubt(given, repaired, torch.ones(1, 1, 1, 1)) for repaired in (moved, nearby))
+    assert float((blurred != moved).float().mean()) > 0.2
+    assert float((again - blurred).abs().max()) < 0.02

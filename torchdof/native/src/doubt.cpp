@@ -45,7 +45,7 @@ class Blur : Frame {
     vec any{};
     each_vector(whole, [&](int y, int x) {
       const vec change = abs(load<vec>(nearness.at(y, x)) - load<vec>(moved.at(y, x)));
-      store(moved.at(y, x), change > MOVED_PX ? broadcast(1.0f) : vec{});
+      store(moved.at(y, x), clamp01(change / MOVED_PX - 0.5f));
       any = max(any, load<vec>(moved.at(y, x)));
     });
     if (!(reduce_max(any) > 0)) return;
@@ -53,8 +53,8 @@ class Blur : Frame {
     const Grid near(beside), is_near(beside), share(part), is_beside(part);
     max_filter<REACH>(nearness, near, rows, beside);
     each_vector(beside, [&](int y, int x) {
-      const vec half = 0.5f * max(load<vec>(near.at(y, x)), broadcast(1.0f));
-      store(is_near.at(y, x), load<vec>(nearness.at(y, x)) > half ? broadcast(1.0f) : vec{});
+      const vec nearest = max(load<vec>(near.at(y, x)), broadcast(1.0f));
+      store(is_near.at(y, x), clamp01(4.0f * load<vec>(nearness.at(y, x)) / nearest - 1.5f));
     });
     clamp_to_frame(is_near, beside);
     sums<REACH>(is_near, share, rows, part, one_over_square(REACH));
@@ -75,11 +75,10 @@ class Blur : Frame {
     for (int y = part.y0; y < part.bottom(); y++)
       for (int x = part.x0; x < part.right(); x++) {
         const float own = *nearness.at(y, x), nearest = *near.at(y, x);
-        float least = 0;
-        if (*is_beside.at(y, x) > 0 && is_beyond(std::fabs(own), nearest))
-          least = OF_NEAR * nearest * std::min(2.0f * *share.at(y, x), 1.0f);
-        if (*high.at(y, x) + *low.at(y, x) > LEAST_STEP_PX) least = std::max(least, LEAST_BLUR_PX * *fading.at(y, x));
-        least *= doubt_;
+        const float is_beyond = *is_beside.at(y, x) * clamp01(beyond_px(std::fabs(own), nearest) + 0.5f);
+        const float is_step = clamp01(*high.at(y, x) + *low.at(y, x) - LEAST_STEP_PX + 0.5f);
+        const float beside = is_beyond * OF_NEAR * nearest * std::min(2.0f * *share.at(y, x), 1.0f);
+        const float least = doubt_ * std::max(beside, is_step * LEAST_BLUR_PX * *fading.at(y, x));
         if (std::fabs(own) < least) out_[(size_t)y * width_ + x] = own > 0 ? -least : least;
       }
   }

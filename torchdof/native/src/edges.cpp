@@ -1093,34 +1093,34 @@ class Repair : Frame {
   // Fits nearness around a pixel as least + difference * blurred by weighted least squares. fit: 0 to 1, high where the
   // blurred shape explains the nearness much better than the unblurred one.
   static Line regress(const Grid &given, const Grid &shape, const Grid &blurred, const float *weights, int y, int x) {
-    const float own = *given.at(y, x), *given_at = given.at(y - REACH, x - REACH);
-    const float *covers[2] = {blurred.at(y - REACH, x - REACH), shape.at(y - REACH, x - REACH)};
-    const int pitches[2] = {blurred.pitch, shape.pitch};
-    vec of_y[2] = {}, of_covers[2][3] = {};  // weighted sums of y, y y; and of x, x x, x y for both shapes
+    const Grid *const maps[3] = {&given, &blurred, &shape};
+    const auto at = [&](int i, const auto &take, vec weight) {  // the weights sum to 1
+      return weight > vec{} ? take(maps[i]->at(y - REACH, x - REACH), maps[i]->pitch) : vec{};
+    };
+    vec sums[3] = {}, squares[3] = {}, products[3] = {};
     each_of_window([&](int n, const auto &take) {
-      const vec weight = load<vec>(weights + n * LANES), none = {}, cy = take(given_at, given.pitch) - own,
-                wy = weight * cy;
-      of_y[0] += wy;
-      of_y[1] += wy * cy;
-      for (int i = 0; i < 2; i++) {
-        const vec cx = weight > none ? take(covers[i], pitches[i]) : none, wx = weight * cx;
-        of_covers[i][0] += wx;
-        of_covers[i][1] += wx * cx;
-        of_covers[i][2] += wx * cy;
+      const vec weight = load<vec>(weights + n * LANES);
+      for (int i = 0; i < 3; i++) sums[i] += weight * at(i, take, weight);
+    });
+    const float means[3] = {reduce_add(sums[0]), reduce_add(sums[1]), reduce_add(sums[2])};
+    each_of_window([&](int n, const auto &take) {
+      const vec weight = load<vec>(weights + n * LANES), off = at(0, take, weight) - means[0];
+      for (int i = 0; i < 3; i++) {
+        const vec its = at(i, take, weight) - means[i];
+        squares[i] += weight * its * its;
+        products[i] += weight * its * off;
       }
     });
-    const float mean_y = reduce_add(of_y[0]), yy = std::max(reduce_add(of_y[1]) - mean_y * mean_y, 0.0f);
-    float mean_x[2], of_x[2], both[2], explained[2];
-    for (int i = 0; i < 2; i++) {
-      mean_x[i] = reduce_add(of_covers[i][0]);
-      of_x[i] = std::max(reduce_add(of_covers[i][1]) - mean_x[i] * mean_x[i], 0.0f);
-      both[i] = std::max(reduce_add(of_covers[i][2]) - mean_x[i] * mean_y, 0.0f);
-      explained[i] = both[i] * both[i] / std::max(of_x[i] * yy, 1e-12f);
+    float explained[3];
+    for (int i = 1; i < 3; i++) {
+      const float product = std::max(reduce_add(products[i]), 0.0f);
+      explained[i] = product * product / std::max(reduce_add(squares[i]) * reduce_add(squares[0]), 1e-12f);
     }
-    const float b = both[0] / std::max(of_x[0], 1e-9f),
-                better = clamp01((explained[0] - explained[1]) / std::max(BETTER * (1.0f - explained[1]), 1e-6f));
-    return {mean_y - b * mean_x[0] + own, b,
-            of_x[0] > 0.004f ? clamp01((explained[0] - EXPLAINED) / EXPLAINED_MORE) * better : 0.0f};
+    const float of_blurred = reduce_add(squares[1]), unexplained = std::max(BETTER * (1.0f - explained[2]), 1e-6f);
+    const float b = std::max(reduce_add(products[1]), 0.0f) / std::max(of_blurred, 1e-9f);
+    const float better = clamp01((explained[1] - explained[2]) / unexplained);
+    return {means[0] - b * means[1], b,
+            of_blurred > 0.004f ? clamp01((explained[1] - EXPLAINED) / EXPLAINED_MORE) * better : 0.0f};
   }
 
   // Raises the nearness of lamps of a few pixels, which a soft map averages with their surroundings.

@@ -43,11 +43,11 @@ inline V apart_px(V near, V far) {
   return far - near - SAME_BLUR * min(max(near, -near), max(far, -far));
 }
 
-// Whether a pixel with this blur is clearly less blurred than, and thus behind, a near surface with that blur: blur <
-// SHARPER near - APART_PX. render/surfaces/doubt.py, is_beyond.
+// How clearly a pixel with this blur is less blurred than, and thus behind, a near surface with that blur, if > 0.
+// render/surfaces/doubt.py, beyond_px.
 template <typename V>
-inline auto is_beyond(V blur, V near) {
-  return blur < SHARPER * near - APART_PX;
+inline V beyond_px(V blur, V near) {
+  return SHARPER * near - APART_PX - blur;
 }
 
 // A pixel between two surfaces, at n from 0 at the far one to 1 at the near one, counts to the near one by clamp(4 n -

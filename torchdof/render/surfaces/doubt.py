@@ -16,18 +16,18 @@ from ..engines.ops import EAGER, Ops
 from ..rules import active
 from .windows import highest, mean_around
 
-__all__ = ["LARGEST", "NEVER", "blurred_in_doubt", "doubt_of", "is_beyond"]
+__all__ = ["LARGEST", "NEVER", "beyond_px", "blurred_in_doubt", "doubt_of"]
 
 _CONTRADICTED = 0.03  # share of clear pixels that contradict the map, on either side, from which it is in doubt
 _OFTEN_CONTRADICTED = 0.045  # the same from which it is fully in doubt
 _ASSUMED = 15.0  # pixels that are assumed to agree with the map; larger: maps with few edges are trusted
-_MOVED_PX = 1.0  # px; change of the coc from which the repair of edges has moved a pixel
+_MOVED_PX = 1.0  # px; change of the coc by which the repair of edges has half moved a pixel
 _REACH = 8  # px; distance from a blurred foreground at which its blur has faded; larger: fewer scraps, softer pictures
 _OF_NEAR = 0.8  # blur beside it in full doubt, over its own; larger: the same
 _LEAST_BLUR_PX = 1.5  # px; least blur at an edge in full doubt
 _AT_EDGE_PX = 2  # px; half the width of the window in which this blur fades
 _EDGE_REACH = 3  # px; distance at which surfaces on both sides of an edge are found
-_LEAST_STEP_PX = 3.0  # px; smallest difference in coc of the two surfaces of an edge
+_LEAST_STEP_PX = 3.0  # px; difference in coc of two surfaces from which they have an edge, by half
 _SHARPER = 0.7  # largest blur of a pixel beyond an edge, over that of the near surface; larger: edges within slopes
 _APART_PX = 2.0  # px; subtracted from it; larger: fewer edges
 
@@ -36,9 +36,9 @@ LARGEST = 1e15  # largest valid nearness or coc, whose square is finite in float
 NEVER = 1e30  # negated, replaces invalid nearness in maxima
 
 
-def is_beyond(blur_px: Tensor, near_px: Tensor) -> Tensor:
-    """Whether a pixel with this blur is clearly less blurred than, and thus behind, a near surface with that blur."""
-    return blur_px < _SHARPER * near_px - _APART_PX
+def beyond_px(blur_px: Tensor, near_px: Tensor) -> Tensor:
+    """How clearly a pixel with this blur is less blurred than, and thus behind, a near surface with that blur, if > 0."""
+    return _SHARPER * near_px - _APART_PX - blur_px
 
 
 def doubt_of(clear: Tensor, agreed: Tensor) -> Tensor:
@@ -86,16 +86,17 @@ def blurred_in_doubt(given: Tensor, repaired: Tensor, doubt: Tensor, ops: Ops = 
 @torch.no_grad()
 def _blurred(given: Tensor, repaired: Tensor, doubt: Tensor) -> Tensor:
     """:func:`blurred_in_doubt` by PyTorch, for float32."""
-    moved = ((repaired - given).abs() > _MOVED_PX).to(repaired.dtype)
     valid = repaired.abs() <= LARGEST
+    moved = torch.where(valid, (repaired - given).abs() / _MOVED_PX - 0.5, 0.0).clamp(0.0, 1.0)
     nearness = torch.where(valid, -repaired, -NEVER)
     near = highest(nearness, _REACH)
-    is_near = (nearness > 0.5 * near.clamp_min(1.0)).to(nearness.dtype)
-    is_beside = is_beyond(nearness.abs(), near) & (highest(moved, _REACH) > 0)
-    beside = torch.where(is_beside, _OF_NEAR * near * (2.0 * mean_around(is_near, _REACH)).clamp(max=1.0), 0.0)
+    is_near = (4.0 * nearness / near.clamp_min(1.0) - 1.5).clamp(0.0, 1.0)
+    is_beyond = (beyond_px(nearness.abs(), near) + 0.5).clamp(0.0, 1.0) * highest(moved, _REACH)
+    beside = is_beyond * _OF_NEAR * near * (2.0 * mean_around(is_near, _REACH)).clamp(max=1.0)
 
     step = highest(nearness, _EDGE_REACH) + highest(torch.where(valid, -nearness, -NEVER), _EDGE_REACH)
-    at_edge = torch.where(step > _LEAST_STEP_PX, _LEAST_BLUR_PX * mean_around(highest(moved, 1), _AT_EDGE_PX), 0.0)
+    is_step = (step - _LEAST_STEP_PX + 0.5).clamp(0.0, 1.0)
+    at_edge = is_step * _LEAST_BLUR_PX * mean_around(highest(moved, 1), _AT_EDGE_PX)
     least = doubt * torch.maximum(beside, at_edge)
     is_sharper = valid & (nearness.abs() < least)
     return torch.where(is_sharper, torch.where(nearness > 0, -least, least), repaired)

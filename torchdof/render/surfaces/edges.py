@@ -25,6 +25,7 @@ from ...tensors import is_differentiated, is_empty, is_in_memory, is_traced
 from ...validation import ends
 from ..engines.ops import EAGER, Ops
 from ..engines.traced import is_compiled, one_operator
+from ..layers.convolution import widest_float
 from ..rules import active
 from .coverage import is_near_edge
 from .doubt import LARGEST, NEVER, blurred_in_doubt, doubt_of
@@ -307,14 +308,15 @@ def _repair(
 
     # a sample of the edge pixels
     batch, _, height, width = given.shape
-    area = torch.scalar_tensor(height * width, dtype=torch.float64, device=given.device)  # not a constant in graphs
+    area = torch.scalar_tensor(height * width, dtype=torch.float64, device="cpu")  # not a constant in graphs
     every = (area / _SAMPLED).sqrt().ceil().long()
     rows, columns = (_from_border(n, given.device) // _BLOCK for n in (height, width))
     sampled = pixels.indices(edges.is_edge & ((rows[:, None] + columns) % every == 0))
 
     def sums(*parts: Tensor) -> tuple[Tensor, ...]:  # over the samples of each item
-        items = given.new_zeros(len(parts), batch)
-        return items.index_add(1, sampled // (height * width), torch.stack(parts))[..., None, None, None].unbind(0)
+        items = given.new_zeros(len(parts), batch, dtype=widest_float(given.device))
+        found = items.index_add(1, sampled // (height * width), torch.stack(parts).to(items.dtype))
+        return found[..., None, None, None].unbind(0)
 
     # whether the map is soft
     is_mixed = edges.is_edge & ((edges.level - 0.5).abs() < 0.25)
@@ -382,7 +384,7 @@ def _repair(
         evidence = torch.ones_like(evidence)
     doubt = given.new_zeros(batch, 1, 1, 1)
     if auto and rules.in_doubt:
-        doubt = torch.where(is_soft, doubt_of(clear, agreed), doubt)
+        doubt = torch.where(is_soft, doubt_of(clear, agreed).to(given.dtype), doubt)
     evidence = torch.maximum(evidence, doubt.flatten().index_select(0, edge_pixels // (height * width)))
     moved = torch.where(is_ramp, evidence, (shows_near != pixels.pick(is_near, edge_pixels)[0]).to(given.dtype))
     out = pixels.put(given, edge_pixels, torch.lerp(own, torch.where(shows_near, near, far), moved))

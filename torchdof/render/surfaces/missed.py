@@ -20,7 +20,7 @@ from ...tensors import is_in_memory, is_traced
 from ..engines.ops import EAGER, Ops
 from ..engines.traced import is_compiled, one_operator
 from ..rules import active
-from .doubt import is_beyond
+from .doubt import beyond_px
 from .windows import highest
 
 __all__ = ["completed"]
@@ -103,7 +103,7 @@ def _completed(image: Tensor, coc_px: Tensor, is_inexact: Tensor, ops: Ops) -> t
     near, ring = torch.full_like(coc, -_FAR_PX), torch.zeros_like(coc)
     for k, (start_px, end_px) in enumerate(itertools.pairwise((0, *_RINGS_PX)), 1):
         around = highest(values, end_px - start_px)
-        is_new = (ring == 0) & is_beyond(blur, around)
+        is_new = (ring == 0) & (beyond_px(blur, around) > 0)
         near, ring = torch.where(is_new, around, near), torch.where(is_new, float(k), ring)
         values = near
     has_edges = ring.any()
@@ -133,7 +133,7 @@ def _completed(image: Tensor, coc_px: Tensor, is_inexact: Tensor, ops: Ops) -> t
 
     for grown in range(0, _GROWTH_PX, _GROWTH_STEP_PX):
         around = highest(surface, _GROWTH_STEP_PX)
-        is_taken = (growth > grown) & is_beyond(blur, around)
+        is_taken = (growth > grown) & (beyond_px(blur, around) > 0)
         surface, growth = torch.where(is_taken, around, surface), torch.where(is_taken, 0.0, growth)
     return ops.equal_unless(lambda: has_edges, torch.where(is_valid, -surface, coc_px), coc_px), share
 
