@@ -21,14 +21,14 @@ MODULES = (
     "native/__init__",
     *(f"optics/{name}" for name in ("kernel_bank", "placed_kernels", "psf")),
     *(f"render/{name}" for name in ("exposure", "highlights", "pipeline")),
-    *(f"render/surfaces/{name}" for name in ("border", "disocclusion", "doubt", "edges", "emitters", "frame")),
-    *(f"render/surfaces/{name}" for name in ("matting", "missed")),
+    *(f"render/surfaces/{name}" for name in ("border", "disocclusion", "doubt", "edge_colours", "edge_search")),
+    *(f"render/surfaces/{name}" for name in ("edges", "emitters", "frame", "matting", "missed", "soft_maps")),
     *(f"render/layers/{name}" for name in ("composite", "convolution", "downsampling", "field")),
     *(f"render/layers/{name}" for name in ("layer_cocs", "layer_weights", "plan")),
 )
 """Modules whose constants C++ may read; a header and its namespace have the name of their module."""
 
-SINGLE = ("doubt", "edges", "missed")
+SINGLE = ("doubt", "edge_colours", "edge_search", "edges", "missed", "soft_maps")
 """Modules whose C++ computes with single precision alone: their constants are ``float``, the others' ``double``."""
 
 Value = int | float | tuple[int | float, ...]

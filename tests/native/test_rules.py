@@ -24,7 +24,7 @@ RULES: dict[str, Callable[[Tensor], Tensor]] = {
     "apart_px(v, broadcast(0.7f))[0]": lambda x: matting._apart_px(x, torch.full_like(x, 0.7)),
     "on_near(v)[0]": matting._on_near,
     "on_far(v)[0]": matting._on_far,
-    "beyond_px(0.4f, x)": lambda x: doubt.beyond_px(torch.full_like(x, 0.4), x),
+    "hiding_px(x)": doubt.hiding_px,
     "end_of_surface(x)": disocclusion.end_of_surface,
     "is_another_surface(x)": disocclusion.is_another_surface,
     "is_another_surface(v)[0]": disocclusion.is_another_surface,

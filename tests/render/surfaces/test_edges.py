@@ -15,7 +15,7 @@ from torchdof.options import DepthEdges
 from torchdof.reference import degraded, metrics
 from torchdof.reference.degraded import KINDS, degrade
 from torchdof.reference.scenes import Plane, Scene, plane_scene, posts, waves
-from torchdof.render.surfaces import edges
+from torchdof.render.surfaces import edge_search, edges
 
 COMPILED = pytest.mark.skipif(not native.chosen(), reason="the compiled engine is not built here")
 
@@ -293,7 +293,7 @@ def test_differences_below_half_a_step_are_not_edges(scene: Scene, kind: str, en
 def test_the_direction_of_an_edge_does_not_depend_on_rounding(moved: float) -> None:
     """Where four blocks meet, the near surface is equally beside and below a pixel."""
     blocks = 3.0 * torch.randint(0, 4, (1, 1, 6, 8)).repeat_interleave(8, -1).repeat_interleave(8, -2) + 0.1
-    found, again = (edges._find(n, n.isfinite(), torch.tensor(1.0)) for n in (blocks, blocks + moved))
+    found, again = (edge_search.find(n, n.isfinite(), torch.tensor(1.0)) for n in (blocks, blocks + moved))
     assert bool(found.is_edge.any())
     assert torch.equal(found.direction[found.is_edge], again.direction[found.is_edge])
 
@@ -309,7 +309,7 @@ def levels_of_a_file(count: int) -> Tensor:
 def test_edges_between_levels_of_a_file_do_not_depend_on_rounding(count: int, moved: float) -> None:
     levels = levels_of_a_file(count).round()
     found, again = (
-        edges._find(n, n.isfinite(), step)
+        edge_search.find(n, n.isfinite(), step)
         for n, step in ((levels, torch.tensor(1.0)), (levels / 3 + moved, torch.tensor(1 / 3)))
     )
     assert int(found.is_ramp.sum()) > 1000

@@ -75,7 +75,7 @@ class Blur : Frame {
     for (int y = part.y0; y < part.bottom(); y++)
       for (int x = part.x0; x < part.right(); x++) {
         const float own = *nearness.at(y, x), nearest = *near.at(y, x);
-        const float is_beyond = *is_beside.at(y, x) * clamp01(beyond_px(std::fabs(own), nearest) + 0.5f);
+        const float is_beyond = *is_beside.at(y, x) * clamp01(nearest - hiding_px(std::fabs(own)) + 0.5f);
         const float is_step = clamp01(*high.at(y, x) + *low.at(y, x) - LEAST_STEP_PX + 0.5f);
         const float beside = is_beyond * OF_NEAR * nearest * std::min(2.0f * *share.at(y, x), 1.0f);
         const float least = doubt_ * std::max(beside, is_step * LEAST_BLUR_PX * *fading.at(y, x));

@@ -11,7 +11,10 @@
 
 #include "api.h"
 #include "constants/doubt.h"
+#include "constants/edge_colours.h"
+#include "constants/edge_search.h"
 #include "constants/edges.h"
+#include "constants/soft_maps.h"
 #include "entry.h"
 #include "grid.h"
 #include "memory.h"
@@ -24,6 +27,9 @@ namespace {
 
 // Python gives the meanings, units and effects of these constants.
 using namespace constants::edges;
+using namespace constants::edge_colours;
+using namespace constants::edge_search;
+using namespace constants::soft_maps;
 using constants::doubt::ASSUMED, constants::doubt::CONTRADICTED, constants::doubt::OFTEN_CONTRADICTED;
 using constants::doubt::LARGEST, constants::doubt::NEVER;
 constexpr int SAMPLE_BLOCK = BLOCK, KINDS = DIRECTIONS * PLACES;
@@ -1083,7 +1089,8 @@ class Repair : Frame {
 
   // Gaussian weights of a window; they sum to 1.
   static std::vector<float> even_window() {
-    std::vector<float> weights = window([](float square) { return std::exp(-square / 18.0f); });
+    std::vector<float> weights =
+        window([](float square) { return std::exp(-square / (2 * LAMP_FALLOFF_PX * LAMP_FALLOFF_PX)); });
     float total = 0;
     for (const float weight : weights) total += weight;
     for (float &weight : weights) weight /= total;

@@ -146,7 +146,7 @@ class Missed {
         for (int at = i * PITCH + LANES; at < (i + 1) * PITCH - LANES; at += LANES) {
           const vec was = load<vec>(near + at);
           const vec least = least_of(lowest + at, PITCH, reach);
-          const ivec is_new = (was == FAR_PX) & (beyond_px(abs(load<vec>(coc + at)), -least) > vec{});
+          const ivec is_new = (was == FAR_PX) & (-least > hiding_px(abs(load<vec>(coc + at))));
           if (!any_of(is_new)) continue;
           is_any_new = true;
           store(near + at, is_new ? least : was);
@@ -392,7 +392,7 @@ class Missed {
           const float coc = map_.out[(size_t)v * width_ + u];
           if (is_valid(coc)) nearest = std::min(nearest, coc);
         });
-        if (!(beyond_px(std::fabs(map_.out[(size_t)y * width_ + x]), -nearest) > 0)) continue;
+        if (!(-nearest > hiding_px(std::fabs(map_.out[(size_t)y * width_ + x])))) continue;
         may = 0;
         near_[(size_t)y * pitch_ + x] = nearest;
         taken.push_back({y, x});

@@ -43,11 +43,11 @@ inline V apart_px(V near, V far) {
   return far - near - SAME_BLUR * min(max(near, -near), max(far, -far));
 }
 
-// How clearly a pixel with this blur is less blurred than, and thus behind, a near surface with that blur, if > 0.
-// render/surfaces/doubt.py, beyond_px.
+// Blur from which a near surface is clearly more blurred than, and thus in front of, a pixel with this blur.
+// render/surfaces/doubt.py, hiding_px.
 template <typename V>
-inline V beyond_px(V blur, V near) {
-  return SHARPER * near - APART_PX - blur;
+inline V hiding_px(V blur) {
+  return (blur + APART_PX) * (1.0f / SHARPER);
 }
 
 // A pixel between two surfaces, at n from 0 at the far one to 1 at the near one, counts to the near one by clamp(4 n -

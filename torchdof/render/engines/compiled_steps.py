@@ -40,6 +40,18 @@ def compiled_step(
     return differentiable(of_batch, gradients_of_batch, plain, *tensors)
 
 
+def by_items(compute: Callable[..., tuple[Tensor, float]], maps: Tensor, *others: Tensor) -> tuple[Tensor, Tensor]:
+    """Maps ``[B, 1, H, W]`` and a number of each item, ``[B, 1, 1, 1]``, item by item.
+
+    ``compute(other, map, *others)`` returns the map of an item and its number; if it returns the given map for each
+    item, so does this function. ``others`` have at least one tensor, ``[B, ...]``.
+    """
+    items = [of_item[0] for of_item in maps]
+    results, numbers = zip(*map(compute, others[0], items, *others[1:]), strict=True)
+    is_new = any(new is not old for new, old in zip(results, items, strict=True))
+    return _stacked(results)[:, None] if is_new else maps, maps.new_tensor(numbers).view(-1, 1, 1, 1)
+
+
 def differentiable(
     forward: Callable[..., Tensor],
     backward: Callable[..., Sequence[Tensor]],

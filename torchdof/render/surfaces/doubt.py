@@ -11,12 +11,14 @@ import torch
 from torch import Tensor
 
 from ... import native
-from ...tensors import is_in_memory, is_traced
+from ...tensors import is_traced
+from ...validation import engine_reads
+from ..engines.compiled_steps import by_items
 from ..engines.ops import EAGER, Ops
 from ..rules import active
 from .windows import highest, mean_around
 
-__all__ = ["LARGEST", "NEVER", "beyond_px", "blurred_in_doubt", "doubt_of"]
+__all__ = ["LARGEST", "NEVER", "blurred_in_doubt", "doubt_of", "hiding_px"]
 
 _CONTRADICTED = 0.03  # share of clear pixels that contradict the map, on either side, from which it is in doubt
 _OFTEN_CONTRADICTED = 0.045  # the same from which it is fully in doubt
@@ -28,7 +30,7 @@ _LEAST_BLUR_PX = 1.5  # px; least blur at an edge in full doubt
 _AT_EDGE_PX = 2  # px; half the width of the window in which this blur fades
 _EDGE_REACH = 3  # px; distance at which surfaces on both sides of an edge are found
 _LEAST_STEP_PX = 3.0  # px; difference in coc of two surfaces from which they have an edge, by half
-_SHARPER = 0.7  # largest blur of a pixel beyond an edge, over that of the near surface; larger: edges within slopes
+_SHARPER = 0.7037  # largest blur of a pixel beyond an edge, over that of the near surface; no simple fraction
 _APART_PX = 2.0  # px; subtracted from it; larger: fewer edges
 
 # Numbers, also of the repair of edges
@@ -36,9 +38,9 @@ LARGEST = 1e15  # largest valid nearness or coc, whose square is finite in float
 NEVER = 1e30  # negated, replaces invalid nearness in maxima
 
 
-def beyond_px(blur_px: Tensor, near_px: Tensor) -> Tensor:
-    """How clearly a pixel with this blur is less blurred than, and thus behind, a near surface with that blur, if > 0."""
-    return _SHARPER * near_px - _APART_PX - blur_px
+def hiding_px(blur_px: Tensor) -> Tensor:
+    """Blur from which a near surface is clearly more blurred than, and thus in front of, a pixel with this blur."""
+    return (blur_px + _APART_PX) * (1.0 / _SHARPER)
 
 
 def doubt_of(clear: Tensor, agreed: Tensor) -> Tensor:
@@ -75,9 +77,8 @@ def blurred_in_doubt(given: Tensor, repaired: Tensor, doubt: Tensor, ops: Ops = 
     if not active().in_doubt or (not is_traced() and not (doubt > 0).any()):
         return repaired
     before, after = (t.detach().float().expand(doubt.shape[0], -1, -1, -1) for t in (given, repaired))
-    if not is_traced() and all(map(is_in_memory, (given, repaired))) and native.chosen():
-        items = zip(before, after, doubt.flatten().tolist(), strict=True)
-        blurred = torch.stack([native.blurred_in_doubt(a[0], b[0], c) for a, b, c in items])[:, None]
+    if engine_reads(before, after):
+        blurred = by_items(lambda a, b, c: (native.blurred_in_doubt(a[0], b, float(c)), 0.0), after, before, doubt)[0]
     else:
         blurred = ops.equal_unless(lambda: (doubt > 0).any(), _blurred(before, after, doubt), after)
     return torch.where(blurred == after, repaired, blurred.to(repaired.dtype))
@@ -91,7 +92,7 @@ def _blurred(given: Tensor, repaired: Tensor, doubt: Tensor) -> Tensor:
     nearness = torch.where(valid, -repaired, -NEVER)
     near = highest(nearness, _REACH)
     is_near = (4.0 * nearness / near.clamp_min(1.0) - 1.5).clamp(0.0, 1.0)
-    is_beyond = (beyond_px(nearness.abs(), near) + 0.5).clamp(0.0, 1.0) * highest(moved, _REACH)
+    is_beyond = (near - hiding_px(nearness.abs()) + 0.5).clamp(0.0, 1.0) * highest(moved, _REACH)
     beside = is_beyond * _OF_NEAR * near * (2.0 * mean_around(is_near, _REACH)).clamp(max=1.0)
 
     step = highest(nearness, _EDGE_REACH) + highest(torch.where(valid, -nearness, -NEVER), _EDGE_REACH)

@@ -16,11 +16,13 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from ... import native
-from ...tensors import is_in_memory, is_traced
+from ...tensors import is_traced
+from ...validation import engine_reads
+from ..engines.compiled_steps import by_items
 from ..engines.ops import EAGER, Ops
 from ..engines.traced import is_compiled, one_operator
 from ..rules import active
-from .doubt import beyond_px
+from .doubt import hiding_px
 from .windows import highest
 
 __all__ = ["completed"]
@@ -80,14 +82,10 @@ def completed(image: Tensor, coc_px: Tensor, before: Tensor, ops: Ops = EAGER) -
         return coc_px, share
     if is_compiled():
         near_px, share = _operator(light, repaired, is_inexact)
-    elif not is_traced() and all(map(is_in_memory, (image, coc_px))) and native.chosen():
-        maps = [of_item[0] for of_item in repaired]
-        of_items = zip(light, maps, is_inexact, strict=True)
-        items, shares = zip(*(native.missed_parts(a, b) if c else (b, 0.0) for a, b, c in of_items), strict=True)
-        share = light.new_tensor(shares).view(-1, 1, 1, 1)
-        if all(new is old for new, old in zip(items, maps, strict=True)):
-            return coc_px, share
-        near_px = torch.stack(items)[:, None]
+    elif engine_reads(light, repaired):
+        near_px, share = by_items(
+            lambda *item: native.missed_parts(*item[:2]) if item[2] else (item[1], 0.0), repaired, light, is_inexact
+        )
     else:
         near_px, share = _completed(light, repaired, is_inexact, ops)
     return torch.where(near_px == repaired, coc_px, near_px.to(coc_px.dtype)), share
@@ -97,13 +95,13 @@ def completed(image: Tensor, coc_px: Tensor, before: Tensor, ops: Ops = EAGER) -
 def _completed(image: Tensor, coc_px: Tensor, is_inexact: Tensor, ops: Ops) -> tuple[Tensor, Tensor]:
     """:func:`completed` by PyTorch, for float32."""
     is_valid = (coc_px.abs() <= _LARGEST_PX) & is_inexact[:, None, None, None]
-    coc, blur = torch.where(is_valid, coc_px, 0.0), torch.where(is_valid, coc_px.abs(), _FAR_PX)
+    coc, hiding = torch.where(is_valid, coc_px, 0.0), torch.where(is_valid, hiding_px(coc_px.abs()), _FAR_PX)
     # blur of the near surface, of which each ring takes the largest around it; negative behind the focus
     surface = values = torch.where(is_valid, -coc_px, -_FAR_PX)
     near, ring = torch.full_like(coc, -_FAR_PX), torch.zeros_like(coc)
     for k, (start_px, end_px) in enumerate(itertools.pairwise((0, *_RINGS_PX)), 1):
         around = highest(values, end_px - start_px)
-        is_new = (ring == 0) & (beyond_px(blur, around) > 0)
+        is_new = (ring == 0) & (around > hiding)
         near, ring = torch.where(is_new, around, near), torch.where(is_new, float(k), ring)
         values = near
     has_edges = ring.any()
@@ -133,7 +131,7 @@ def _completed(image: Tensor, coc_px: Tensor, is_inexact: Tensor, ops: Ops) -> t
 
     for grown in range(0, _GROWTH_PX, _GROWTH_STEP_PX):
         around = highest(surface, _GROWTH_STEP_PX)
-        is_taken = (growth > grown) & (beyond_px(blur, around) > 0)
+        is_taken = (growth > grown) & (around > hiding)
         surface, growth = torch.where(is_taken, around, surface), torch.where(is_taken, 0.0, growth)
     return ops.equal_unless(lambda: has_edges, torch.where(is_valid, -surface, coc_px), coc_px), share
 

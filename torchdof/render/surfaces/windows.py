@@ -1,7 +1,12 @@
 """Windows of pixels around each pixel of a map."""
 
+import math
+
+import torch
 import torch.nn.functional as functional
 from torch import Tensor
+
+from ...optics.kernel_cache import kept
 
 
 def highest(values: Tensor, reach: int) -> Tensor:
@@ -18,3 +23,11 @@ def mean_around(values: Tensor, reach: int) -> Tensor:
     side = 2 * reach + 1
     rows = functional.avg_pool2d(functional.pad(values, (reach,) * 4, mode="replicate"), (1, side), stride=1)
     return functional.avg_pool2d(rows, (side, 1), stride=1)
+
+
+@kept
+def gaussian(reach: int, sigma: float, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Gaussian weights ``[(2 reach + 1)^2, 1]`` of a square, in the order of :func:`torchdof.pixels.around`."""
+    steps = range(-reach, reach + 1)
+    weights = [math.exp(-(dy * dy + dx * dx) / (2.0 * sigma**2)) for dy in steps for dx in steps]
+    return torch.tensor(weights, dtype=dtype, device=device)[:, None]
