@@ -1,0 +1,25 @@
+// Finds the edges of a depth map: the compiled version of torchdof/render/surfaces/edge_search.py.
+#pragma once
+#include <cmath>
+#include <vector>
+
+#include "edge_map.h"
+
+namespace torchdof {
+
+// Smallest step, in standard deviations `noises` of the map's noise. edge_search.cpp
+float step_of_noise(const torchdof_map &map, float noises);
+
+// Finds the edges of parts, and marks the pixels up to `halo` around them; adds those of the selected kinds to the
+// groups. Returns the sums over all edge pixels if they are wanted. edge_search.cpp
+EdgeSums find_edges(const EdgeMap &map, std::vector<Group> &groups, int halo, bool expects_ramps, bool measures,
+                    const KindMask &selected);
+
+// Whether a level on a step, 0 (far) to 1 (near), is in the middle half.
+inline bool is_mixed(float level) { return std::fabs(level - 0.5f) < 0.25f; }
+
+// Gradient at a pixel as a fraction of the step `gap`, given the offsets of its neighbours. The sum over a step's
+// pixels is its length in pixels.
+float climb(const float *value, int left, int right, int above, int below, float gap);
+
+}  // namespace torchdof
