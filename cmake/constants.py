@@ -28,7 +28,10 @@ MODULES = (
 )
 """Modules whose constants C++ may read; a header and its namespace have the name of their module."""
 
-SINGLE = ("doubt", "edge_colours", "edge_search", "edges", "missed", "soft_maps")
+SINGLE = (
+    *("composite", "disocclusion", "doubt", "edge_colours", "edge_search", "edges"),
+    *("emitters", "frame", "matting", "missed", "pipeline", "soft_maps"),
+)
 """Modules whose C++ computes with single precision alone: their constants are ``float``, the others' ``double``."""
 
 Value = int | float | tuple[int | float, ...]

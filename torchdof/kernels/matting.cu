@@ -302,10 +302,10 @@ extern "C" __global__ void __launch_bounds__(TILE_ROWS * TILE_COLUMNS) split_bac
     }
     const float near = torchdof::unlimited_on_near(n.nearness), far = torchdof::unlimited_on_far(n.nearness), valid = counts(r, n.pixel);
     const float of_sides = (within(near) ? of_nearer : 0.0f) - (within(far) ? of_farther : 0.0f);
-    const float of_nearness = (4 * n.unmixed * of_sides + of.covered * falloff(i, SMALL_BESIDE) * valid * s.per_counted) / s.gap;
+    const float of_nearness = (4 * n.unmixed * of_sides + of.covered * falloff(i, SOFTNESS_FALLOFF) * valid * s.per_counted) / s.gap;
     of.far += of_nearness;
     of.gap -= of_nearness * n.nearness;
-    parts.at(OF_EDGE, i) = (i == MIDDLE ? of.edge : 0.0f) - falloff(i, BESIDE) * valid * (of_nearer * clamp01(near) + of_farther * clamp01(far));
+    parts.at(OF_EDGE, i) = (i == MIDDLE ? of.edge : 0.0f) - falloff(i, FALLOFF) * valid * (of_nearer * clamp01(near) + of_farther * clamp01(far));
     parts.at(OF_COC, i) = (i == MIDDLE ? of.coc : 0.0f) - of_nearness;
   }
   parts.add_ends(r, p, s.ends, of.near - of.gap, of.far + of.gap);
@@ -356,7 +356,7 @@ extern "C" __global__ void find_clean_back(const __grid_constant__ Run r) {
       parts.at(c, i) = of_mean * weight + (i == MIDDLE ? of_clean[c] - of_clean[c] * s.taken() : 0.0f);
     }
     const float of_apart = within(alike) ? -2 * sign(apart) * of_weight * unmixed(r, q, i) / EDGE_PX : 0.0f;
-    parts.at(OF_EDGE, i) = (i == MIDDLE ? of_taken * clamp01(s.enough) : 0.0f) - of_weight * clamp01(alike) * falloff(i, BESIDE) * counts(r, q);
+    parts.at(OF_EDGE, i) = (i == MIDDLE ? of_taken * clamp01(s.enough) : 0.0f) - of_weight * clamp01(alike) * falloff(i, FALLOFF) * counts(r, q);
     parts.at(OF_COC, i) = of_apart;
     of_coc -= of_apart;
   }

@@ -6,17 +6,8 @@
 using torchdof::clamp01;
 using torchdof::TINY;
 using torchdof::within;
+using namespace torchdof::constants::matting;
 
-constexpr float EDGE_PX = torchdof::constants::matting::EDGE_PX;
-constexpr float BESIDE = torchdof::constants::matting::FALLOFF;
-constexpr float UNCLEAN = torchdof::constants::matting::UNCLEAN;
-constexpr float TRUST = torchdof::constants::matting::TRUST;
-constexpr float TEXTURE = torchdof::constants::matting::TEXTURE;
-constexpr float MOST_CLEAN = torchdof::constants::matting::MOST_CLEAN;
-constexpr float SMALL_BESIDE = torchdof::constants::matting::SOFTNESS_FALLOFF;
-constexpr float ALIKE = torchdof::constants::matting::ALIKE;
-constexpr float UNBOUNDED = torchdof::constants::matting::UNBOUNDED;
-constexpr float NEVER_PX = torchdof::constants::matting::NEVER_PX;
 constexpr float LEAST = 1e-12f;          // smallest divisor
 
 constexpr int TILE_ROWS = 4, TILE_COLUMNS = 32;  // a block of threads, as in matting.py
@@ -100,7 +91,7 @@ __device__ inline Ends ends_of(const Run &r, const Pixel &p) {
 }
 
 // Weight of pixel i around in a mean over unmixed pixels.
-__device__ inline float unmixed(const Run &r, const Pixel &q, int i) { return (1 - edge_of(r, q) + UNCLEAN) * falloff(i, BESIDE) * counts(r, q); }
+__device__ inline float unmixed(const Run &r, const Pixel &q, int i) { return (1 - edge_of(r, q) + UNCLEAN) * falloff(i, FALLOFF) * counts(r, q); }
 
 // The light of a pixel's own surface around it: the mean, and how far it takes the place of the pixel's light.
 struct Same {

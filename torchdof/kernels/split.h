@@ -106,7 +106,7 @@ __device__ inline Split split_of(const Run &r, const Pixel &p) {
   s.total_nearer = s.total_farther = s.covered = s.per_counted = 0;
   TAP_BY_TAP for (int i = 0; i < TAPS; i++) {
     const Neighbour n = s.neighbour(r, p, i);
-    const float small = falloff(i, SMALL_BESIDE) * counts(r, n.pixel);
+    const float small = falloff(i, SOFTNESS_FALLOFF) * counts(r, n.pixel);
     s.total_nearer += n.nearer;
     s.total_farther += n.farther;
     s.covered += small * n.nearness;

@@ -32,7 +32,7 @@
 namespace torchdof {
 namespace {
 
-constexpr int MOST_PLANES = constants::native::MOST_PLANES;
+using constants::native::MOST_PLANES;
 static_assert(BLOCK % STRIP_COLUMNS == 0 && BLOCK % STRIP_ROWS == 0, "strips fill a block");
 
 inline vec load_some(const float *p, int n) {
@@ -237,8 +237,8 @@ class Blend {
     cell_rows_ = ceil_div(scene_.rows, CELL);
     cell_columns_ = ceil_div(scene_.columns, CELL);
     cells_.assign((size_t)cell_rows_ * cell_columns_ * words_, 0);
-    lows_.assign((size_t)cell_rows_ * cell_columns_, NEVER);
-    highs_.assign(lows_.size(), -NEVER);
+    lows_.assign((size_t)cell_rows_ * cell_columns_, NEVER_PX);
+    highs_.assign(lows_.size(), -NEVER_PX);
     std::vector<float> nodes;
     for (const Layer &l : layers_) nodes.push_back(l.at);
     const int last = (int)nodes.size() - 1;

@@ -8,11 +8,10 @@
 
 namespace torchdof {
 
-constexpr float NEVER = constants::matting::NEVER_PX;
+using constants::matting::NEVER_PX;
 
 // The position of a signed coc, clamped to [low, high], and its inverse.
-constexpr double SQUARE_PX = constants::layer_weights::SQUARE_PX;
-constexpr double IN_FOCUS = constants::layer_weights::IN_FOCUS;
+using constants::layer_weights::IN_FOCUS, constants::layer_weights::SQUARE_PX;
 template <typename V>
 inline V axis(V coc, float low, float high) {
   const V zero = {}, focus = zero + (float)IN_FOCUS, size = max(coc, -coc), x = coc * size / (size + (float)SQUARE_PX);

@@ -14,7 +14,7 @@
 
 namespace torchdof {
 
-constexpr double STEP = constants::border::STEP;
+using constants::border::STEP;
 
 // The part of a difference on the blur axis that is a step between surfaces; 0 for a slope. Below, its derivative.
 static double step_of(double difference) {

@@ -30,7 +30,7 @@
 namespace torchdof {
 namespace {
 
-constexpr float LEAST = constants::composite::LEAST;
+using constants::composite::LEAST;
 constexpr float COVERED = 1e-6f;  // an uncovered part up to this is a rounding error
 constexpr int TILE_PIXELS = TILE * TILE;
 constexpr int PART = 16;                // side in pixels of the parts of a coarse canvas that are skipped if empty
@@ -253,7 +253,7 @@ class Composite {
 
   // The places of a cell's pixels. A row cut off by the frame repeats its last pixel.
   struct CellPlaces {
-    float all[CELL * CELL], shown[CELL * CELL];                // shown: of pixels with weight, else NEVER
+    float all[CELL * CELL], shown[CELL * CELL];                // shown: of pixels with weight, else NEVER_PX
     float own_cocs[CELL * CELL], own_weights[CELL * CELL];     // of the first surface
     vec low, high, least_weight, most_weight, farther_weight;  // farther_weight: largest of the farther of two surfaces
   };
@@ -274,7 +274,7 @@ class Composite {
   // Returns false if a cell has no surface i.
   bool read_places(int row, int column, int i, const float **light, CellPlaces &p) const {
     const int x0 = column * CELL, n = std::min(CELL, W_ - x0), rows = std::min(CELL, H_ - row * CELL);
-    p.low = broadcast(NEVER), p.high = broadcast(-NEVER);
+    p.low = broadcast(NEVER_PX), p.high = broadcast(-NEVER_PX);
     p.least_weight = broadcast(1.0f), p.most_weight = p.farther_weight = vec{};
     for (int y = 0; y < rows; y++) {
       const float *coc, *weight;
@@ -290,9 +290,9 @@ class Composite {
         const vec w = weight ? load<vec>(weight + x) : broadcast(1.0f);
         const auto weighs = w != vec{};
         store(p.all + y * CELL + x, place);
-        store(p.shown + y * CELL + x, weighs ? place : broadcast(NEVER));
-        p.low = min(p.low, weighs ? place : broadcast(NEVER));
-        p.high = max(p.high, weighs ? place : broadcast(-NEVER));
+        store(p.shown + y * CELL + x, weighs ? place : broadcast(NEVER_PX));
+        p.low = min(p.low, weighs ? place : broadcast(NEVER_PX));
+        p.high = max(p.high, weighs ? place : broadcast(-NEVER_PX));
         p.least_weight = min(p.least_weight, w);
         p.most_weight = max(p.most_weight, w);
         float *const own_coc = p.own_cocs + y * CELL + x, *const own_weight = p.own_weights + y * CELL + x;
@@ -327,8 +327,8 @@ class Composite {
       for (int x = 0; x < n; x++) intervals[(size_t)y * W_ + x] = (uint16_t)nodes[x];
     }
     for (int k = first; k <= std::min(last + 1, N_ - 1); k++) {  // layer k occurs between nodes k - 1 and k + 1
-      const vec before = broadcast(k == first ? -NEVER : layers_[k - 1].at);
-      const vec after = broadcast(k > last || k == N_ - 1 ? NEVER : layers_[k + 1].at);
+      const vec before = broadcast(k == first ? -NEVER_PX : layers_[k - 1].at);
+      const vec after = broadcast(k > last || k == N_ - 1 ? NEVER_PX : layers_[k + 1].at);
       ivec found = {};
       for (int j = 0; j < rows * CELL; j += LANES) {
         const vec place = load<vec>(p.shown + j);

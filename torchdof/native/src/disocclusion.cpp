@@ -20,12 +20,9 @@
 namespace torchdof {
 namespace {
 
-constexpr float FALL = constants::disocclusion::FALL;
-constexpr float SURE = constants::disocclusion::SURE;
-constexpr float MIXED = constants::disocclusion::MIXED;
-constexpr float HIDING_FROM_PX = constants::disocclusion::HIDING_FROM_PX;
-constexpr int BAND = 8;        // rows of a level computed together
-constexpr int CELL_LEVEL = 3;  // cells that may show hidden surfaces have the size of this level's samples
+using namespace constants::disocclusion;  // render/surfaces/disocclusion.py gives meanings, units and effects
+constexpr int BAND = 8;                   // rows of a level computed together
+constexpr int CELL_LEVEL = 3;             // cells that may show hidden surfaces have the size of this level's samples
 
 // One level of a pyramid of the farthest surfaces. A sample has `stride` values: light of each channel, coc, weight,
 // padding.
@@ -246,7 +243,7 @@ class Filling {
                                            : load<vec>(b.own + c * BLOCK_PIXELS + first + x));
       }
       for (int x = 0; s_.valid && x < n; x++)
-        if (!(s_.valid[(size_t)y * job_.width + x0 + x] > 0)) coc[x] = -NEVER;
+        if (!(s_.valid[(size_t)y * job_.width + x0 + x] > 0)) coc[x] = -NEVER_PX;
     }
     if (!bright) return;
     for (int x = 0; x < n; x += LANES) {
@@ -296,7 +293,7 @@ class Filling {
         vec sum = {};
         for (int j = 0; j < count; j++) sum += child[j] * counts[j];
         sum *= each;
-        put(k, k < C ? sum : total > vec{} ? sum : broadcast(-NEVER));
+        put(k, k < C ? sum : total > vec{} ? sum : broadcast(-NEVER_PX));
       }
       put(C + 1, total);
     }
@@ -308,7 +305,7 @@ class Filling {
     for (int y = band * BAND; y < std::min(level.height, (band + 1) * BAND); y++)
       for (int x = 0; x < level.width; x++) {
         const float *child[4];
-        float farthest = -NEVER, total = 0, counts[4], *out = level.at(y, x);
+        float farthest = -NEVER_PX, total = 0, counts[4], *out = level.at(y, x);
         for (int k = 0; k < 4; k++) {
           child[k] = fine.at(2 * y + k / 2, 2 * x + k % 2);
           farthest = std::max(farthest, child[k][C_]);
@@ -320,7 +317,7 @@ class Filling {
         for (int c = 0; c <= C_; c++)
           out[c] =
               child[0][c] * counts[0] + child[1][c] * counts[1] + child[2][c] * counts[2] + child[3][c] * counts[3];
-        if (!(total > 0)) out[C_] = -NEVER;
+        if (!(total > 0)) out[C_] = -NEVER_PX;
         out[C_ + 1] = total;
         std::fill(out + C_ + 2, out + stride_, 0.0f);
       }
@@ -338,7 +335,7 @@ class Filling {
         // range of the samples read by the cell's pixels, including those shared with other cells
         const int y0 = (int)l.place_y(row * cell_) - 1, y1 = (int)l.place_y(row * cell_ + cell_ - 1) + 2;
         const int x0 = (int)l.place_x(column * cell_) - 1, x1 = (int)l.place_x(column * cell_ + cell_ - 1) + 2;
-        float most = -NEVER;
+        float most = -NEVER_PX;
         for (int y = std::max(0, y0); y <= std::min(l.height - 1, y1); y++)
           for (int x = std::max(0, x0); x <= std::min(l.width - 1, x1); x++) most = std::max(most, l.coc(y, x));
         if (is_another_surface(most - near) > 0) {
@@ -463,7 +460,7 @@ class Filling {
     for (int r = y0 / cell_; r <= y1 / cell_; r++)
       for (int c = x0 / cell_; c <= x1 / cell_; c++) found |= found_[(size_t)r * cell_columns_ + c];
     if (!found) return false;
-    nearest = NEVER;
+    nearest = NEVER_PX;
     for (int y = y0; y <= y1; y++)
       for (int x = x0; x <= x1; x++) {
         nearest = std::min(nearest, s_.coc[(size_t)y * W + x]);

@@ -5,11 +5,8 @@
 
 namespace torchdof {
 
-constexpr float LEAST_SEEN = constants::disocclusion::LEAST_SEEN;
-constexpr float LEAST_TOTAL = constants::disocclusion::LEAST_TOTAL;
-constexpr float CERTAIN = constants::disocclusion::CERTAIN;
-constexpr int FINE_LEVELS = constants::disocclusion::FINE_LEVELS;
-constexpr int BEHIND_STEP = constants::disocclusion::BEHIND_STEP;
-constexpr int MOST_LEVELS = constants::native::MOST_LEVELS;
+using constants::disocclusion::BEHIND_STEP, constants::disocclusion::CERTAIN, constants::disocclusion::FINE_LEVELS;
+using constants::disocclusion::LEAST_SEEN, constants::disocclusion::LEAST_TOTAL;
+using constants::native::MOST_LEVELS;
 
 }  // namespace torchdof

@@ -18,10 +18,7 @@
 namespace torchdof {
 namespace {
 
-constexpr float DIM = constants::emitters::DIM;
-constexpr float LEAST_PEAK = constants::emitters::LEAST_PEAK;
-constexpr float MOST_WEIGHT = constants::emitters::MOST_WEIGHT;
-constexpr int TOUCHING = constants::emitters::TOUCHING;
+using namespace constants::emitters;      // render/surfaces/emitters.py gives meanings, units and effects
 enum Side { IN_FRONT = -1, BEHIND = 1 };  // of an emitter, relative to a surface
 
 // Estimates from the pixels around a highlight on which surface its emitter lies.
@@ -105,7 +102,7 @@ class Around {
   const float *falloff_;
   const bool matted_;
   size_t at_[COUNT];
-  float coc_[COUNT], peaks_[COUNT], nearest_ = NEVER, nearest_touching_ = NEVER, farthest_ = -NEVER;
+  float coc_[COUNT], peaks_[COUNT], nearest_ = NEVER_PX, nearest_touching_ = NEVER_PX, farthest_ = -NEVER_PX;
 
  public:
   float scale = 0;  // largest light around

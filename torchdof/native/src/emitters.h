@@ -5,7 +5,7 @@
 
 namespace torchdof {
 
-constexpr int EMITTER_REACH = constants::emitters::EMITTER_REACH;
+using constants::emitters::EMITTER_REACH;
 
 // Assigns the light of a highlight's pixel to the surface of its emitter, in front of the pixel's own surface or
 // behind.

@@ -27,8 +27,8 @@
 namespace torchdof {
 namespace {
 
-constexpr int MOST_PLANES = constants::native::MOST_PLANES;
-constexpr float MIXED = constants::disocclusion::MIXED;
+using constants::disocclusion::MIXED;
+using constants::native::MOST_PLANES;
 constexpr int BAND = 32;  // rows of pixels whose gradients one thread adds up
 
 // The pixels of an axis around each sample: `taps` of them from 2 sample - before on, which the frame's ends repeat.
@@ -60,7 +60,7 @@ class Farthest {
         look(y, x, s);
         float *to = out + (size_t)y * columns_.samples + x;
         for (int c = 0; c < channels(); c++) to[c * size] = s.mean[c];
-        to[channels() * size] = s.total > 0 ? s.mean[channels()] : -NEVER;
+        to[channels() * size] = s.total > 0 ? s.mean[channels()] : -NEVER_PX;
         to[(channels() + 1) * size] = s.total;
       }
     });
@@ -103,7 +103,7 @@ class Farthest {
         t.share = 0.25f * rows_.share(i) * columns_.share(j);
         t.mixed = coc_[1] && weight_[t.at] > MIXED && coc_[1][t.at] > coc_[0][t.at];
         t.valid = valid_ ? valid_[t.at] : 1.0f;
-        t.coc = t.valid > 0 ? coc_[t.mixed][t.at] : -NEVER;
+        t.coc = t.valid > 0 ? coc_[t.mixed][t.at] : -NEVER_PX;
         t.weight = (t.mixed || !coc_[1] ? weight_[t.at] : 1.0f - weight_[t.at]) * t.valid;
         t.peak = peak_of(light_[t.mixed] + t.at, area_, channels());
         t.dimmed = threshold_ && t.peak > threshold_[t.at] ? threshold_[t.at] / t.peak : 1.0f;

@@ -338,7 +338,7 @@ struct CellBits {
 Visibility find_visibility(const Job &job, const RayKernels &kernels) {
   Visibility v;
   const int H = job.height, W = job.width;
-  float low = NEVER, high = -NEVER;
+  float low = NEVER_PX, high = -NEVER_PX;
   for (int i = 0; i < job.surfaces.block_rows * job.surfaces.block_columns; i++) {
     low = std::min(low, job.block_low[i]);
     high = std::max(high, job.block_high[i]);

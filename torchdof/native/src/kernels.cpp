@@ -14,8 +14,7 @@
 namespace torchdof {
 namespace {
 
-constexpr int MARGIN_PX = constants::psf::MARGIN_PX;
-constexpr double RIPPLING = constants::psf::RIPPLING;
+using constants::psf::MARGIN_PX, constants::psf::RIPPLING;
 constexpr int FAR = 11;  // distance in pixels beyond which the spline is below 5e-7
 constexpr double ROOT = 1.7320508075688772, PI = 3.141592653589793;
 

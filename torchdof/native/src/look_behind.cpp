@@ -29,7 +29,7 @@
 namespace torchdof {
 namespace {
 
-constexpr int MOST_PLANES = constants::native::MOST_PLANES;
+using constants::native::MOST_PLANES;
 constexpr int BAND = 32;  // least rows of places whose gradients one thread adds up
 
 // Places of an axis, pixels or cells, `step` pixels apart and centred on an image; and the pixels of each place, as

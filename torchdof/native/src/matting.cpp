@@ -27,14 +27,8 @@ namespace torchdof {
 namespace {
 
 // Constants of matting.py and pipeline.py in render, which give their meanings, units and effects.
-constexpr float EDGE_PX = constants::matting::EDGE_PX;
-constexpr float UNCLEAN = constants::matting::UNCLEAN;
-constexpr float TRUST = constants::matting::TRUST;
-constexpr float TEXTURE = constants::matting::TEXTURE;
-constexpr float MOST_CLEAN = constants::matting::MOST_CLEAN;
-constexpr float ALIKE = constants::matting::ALIKE;
-constexpr float UNBOUNDED = constants::matting::UNBOUNDED;
-constexpr float SAME_PX = constants::pipeline::SAME_PX;
+using namespace constants::matting;
+using constants::pipeline::SAME_PX;
 
 // Windows around the pixels of a block
 constexpr int REACH = 1;  // pixels around a mixed pixel that define its two colours
@@ -50,8 +44,7 @@ constexpr int PITCH = 24;                 // of all
 vec edge_of(vec near, vec far) { return apart_px(near, far) * (1.0f / EDGE_PX) - 1.0f; }
 
 // Falloff of the Gaussian by which two surfaces mix, beside its centre.
-constexpr float SMALL_BESIDE = constants::matting::SOFTNESS_FALLOFF;
-constexpr float SMALL_DIAGONAL = SMALL_BESIDE * SMALL_BESIDE;
+constexpr float SOFTNESS_DIAGONAL = SOFTNESS_FALLOFF * SOFTNESS_FALLOFF;
 
 // An image whose mixed pixels are split.
 struct Frame {
@@ -118,8 +111,8 @@ bool find_edges(const Frame &frame, int y0, int x0, Window &w) {
   read_window(frame, frame.coc, y0 - MARGIN, x0 - MARGIN, SIDE, w.coc);
   if (valid) read_window(frame, valid, y0 - MARGIN, x0 - MARGIN, SIDE, w.valid);
   for (int i = 0; valid && i < SIDE * PITCH; i++) {
-    lows[i] = w.valid[i] > 0 ? w.coc[i] : NEVER;
-    highs[i] = w.valid[i] > 0 ? w.coc[i] : -NEVER;
+    lows[i] = w.valid[i] > 0 ? w.coc[i] : NEVER_PX;
+    highs[i] = w.valid[i] > 0 ? w.coc[i] : -NEVER_PX;
   }
   for (int i = 0; i < EDGES; i++) {
     float least_of[PITCH + LANES], most_of[PITCH + LANES];
@@ -149,14 +142,14 @@ inline void add(float *to, vec value) { store(to, load<vec>(to) + value); }
 
 // The nearest and farthest coc of the 3 x 3 pixels from a place of a window on.
 struct Ends {
-  vec near = broadcast(NEVER), far = broadcast(-NEVER);
+  vec near = broadcast(NEVER_PX), far = broadcast(-NEVER_PX);
 
   Ends(const Window &w, int at, bool masked) {
     for (int i = 0; i < TAPS; i++) {
       const vec coc = load<vec>(w.coc + at + tap(i));
       const ivec valid = masked ? load<vec>(w.valid + at + tap(i)) > vec{} : vec{} == vec{};
-      near = min(near, valid ? coc : broadcast(NEVER));
-      far = max(far, valid ? coc : broadcast(-NEVER));
+      near = min(near, valid ? coc : broadcast(NEVER_PX));
+      far = max(far, valid ? coc : broadcast(-NEVER_PX));
     }
   }
 
@@ -377,7 +370,7 @@ class Split {
                            gap_;  // not times 1 / gap, whose rounding the clamps below enlarge
       nearer_[i] = weight * on_near(nearness);
       farther_[i] = weight * on_far(nearness);
-      small_[i] = (i == TAPS / 2 ? 1.0f : i % 2 ? SMALL_BESIDE : SMALL_DIAGONAL) * valid_[i];
+      small_[i] = (i == TAPS / 2 ? 1.0f : i % 2 ? SOFTNESS_FALLOFF : SOFTNESS_DIAGONAL) * valid_[i];
       covered_ += small_[i] * nearness, counted += small_[i];
     }
     per_counted_ = 1.0f / max(counted, broadcast(1e-12f));
@@ -778,7 +771,7 @@ void Job::split_mixed() {
     if (!windows[worker]) windows[worker].reset(new Window(channels));
     Window &w = *windows[worker];
     for (int bx = 0; bx < columns; bx++) {
-      float low = NEVER, high = -NEVER;
+      float low = NEVER_PX, high = -NEVER_PX;
       for (int v = std::max(by - 1, 0); v <= std::min(by + 1, rows - 1); v++)
         for (int u = std::max(bx - 1, 0); u <= std::min(bx + 1, columns - 1); u++) {
           low = std::min(low, block_low[v * columns + u]);

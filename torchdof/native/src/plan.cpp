@@ -21,24 +21,10 @@
 namespace torchdof {
 namespace {
 
-constexpr double FINEST = constants::layer_cocs::FINEST;
-constexpr double FINEST_PARTS = constants::layer_cocs::FINEST_PARTS;
-constexpr double WIDE = constants::layer_cocs::WIDE;
-constexpr double SPACING = constants::layer_cocs::SPACING;
-constexpr double SPACING_POWER = constants::layer_cocs::SPACING_POWER;
-constexpr double LOOSE = constants::layer_cocs::LOOSE;
-constexpr double NEAR = constants::layer_cocs::NEAR;
-constexpr double GROWS_FROM_PX = constants::layer_cocs::GROWS_FROM_PX;
-constexpr double GROWTH = constants::layer_cocs::GROWTH;
-constexpr double CROWD = constants::layer_cocs::CROWD;
-constexpr double APART = constants::layer_cocs::APART;
-constexpr int FEW = constants::layer_cocs::FEW;
-constexpr int LEAST_CROWD = constants::layer_cocs::LEAST_CROWD;
+// render/layers/layer_cocs.py and plan.py give meanings, units and effects
+using namespace constants::layer_cocs;
+using namespace constants::plan;
 constexpr float WIDEST = constants::layer_cocs::WIDEST;
-constexpr double SMALL_RADII = constants::plan::SMALL_RADII;
-constexpr double ROUGH_PX = constants::plan::ROUGH_PX;
-constexpr double ROUGH_TOLERANCE = constants::plan::ROUGH_TOLERANCE;
-constexpr double CROWDS_FROM = constants::plan::CROWDS_FROM;
 
 double finest(double x) { return std::max(FINEST, std::fabs(x) / FINEST_PARTS); }
 

@@ -13,22 +13,15 @@
 
 namespace torchdof {
 
-// Constants of Python modules, which give their meanings, units and effects; here with the type of the computations.
-constexpr float KNOWN = constants::composite::KNOWN;
-constexpr float SAME_BLUR = constants::matting::SAME_BLUR;
+// Constants of Python modules, which give their meanings, units and effects.
+using constants::composite::KNOWN;
+using constants::disocclusion::BEHIND_PX, constants::disocclusion::OWN_SLOPE;
 using constants::doubt::APART_PX, constants::doubt::SHARPER;
-constexpr float BEHIND_PX = constants::disocclusion::BEHIND_PX;
-constexpr float OWN_SLOPE = constants::disocclusion::OWN_SLOPE;
+using constants::frame::AT_FOCUS, constants::frame::OFF_FOCUS, constants::frame::BARELY_BLURRED;
+using constants::frame::CONTINUES_FROM, constants::frame::COUNTED, constants::frame::HIDDEN_WEIGHT;
+using constants::frame::HIDING_SHARE, constants::frame::LEAST_PASSING, constants::frame::SEEN_FROM;
+using constants::matting::SAME_BLUR;
 constexpr float FOOT = constants::layer_weights::FOOT;
-constexpr float HIDDEN_WEIGHT = constants::frame::HIDDEN_WEIGHT;
-constexpr float HIDING_SHARE = constants::frame::HIDING_SHARE;
-constexpr float LEAST_PASSING = constants::frame::LEAST_PASSING;
-constexpr float CONTINUES_FROM = constants::frame::CONTINUES_FROM;
-constexpr float AT_FOCUS = constants::frame::AT_FOCUS;
-constexpr float OFF_FOCUS = constants::frame::OFF_FOCUS;
-constexpr float BARELY_BLURRED = constants::frame::BARELY_BLURRED;
-constexpr float COUNTED = constants::frame::COUNTED;
-constexpr float SEEN_FROM = constants::frame::SEEN_FROM;
 
 // Whether 0 <= v <= 1.
 template <typename V>
