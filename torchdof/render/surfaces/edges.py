@@ -266,7 +266,7 @@ class _Map(NamedTuple):
 
     def sums(self, sampled: Tensor, *parts: Tensor) -> tuple[Tensor, ...]:
         """Sums of values ``[P]`` of sampled pixels over each item, ``[B, 1, 1, 1]`` each."""
-        items = self.nearness.new_zeros(len(parts), len(self.nearness), dtype=widest_float(self.nearness.device))
+        items = self.nearness.new_zeros(len(parts), self.nearness.shape[0], dtype=widest_float(self.nearness.device))
         found = items.index_add(1, self.item_of(sampled), torch.stack(parts).to(items.dtype))
         return found[..., None, None, None].unbind(0)
 
@@ -328,8 +328,8 @@ def _errors_of(scene: _Map, auto: bool, ops: Ops) -> _Errors:
     kind = edge_search.kinds(edges)
     score = judge(scene.looks, scene.nearness, sampled, sharpness, CLEAR_IN_PRIOR, False, ops).score
     weight = (0.5 * score.abs()).clamp(max=1.0)
-    prior = _calibrate(pixels.pick(kind, sampled)[0], score, weight, len(scene.nearness))[kind]
-    doubt = scene.nearness.new_zeros(len(scene.nearness), 1, 1, 1)
+    prior = _calibrate(pixels.pick(kind, sampled)[0], score, weight, scene.nearness.shape[0])[kind]
+    doubt = scene.nearness.new_zeros(scene.nearness.shape[0], 1, 1, 1)
     if not auto:
         return _Errors(is_soft, sharpness, prior, edges.is_edge, doubt)
 
