@@ -14,7 +14,7 @@ from torchdof import BlurTable, blur_by_coc, native
 from torchdof.render.engines.ops import EAGER, Level
 from torchdof.render.layers.plan import Plan
 from torchdof.render.surfaces import disocclusion
-from torchdof.render.surfaces.frame import Surface, pad_to_frame
+from torchdof.render.surfaces.frame import Beyond, Surface, pad_to_frame
 from torchdof.render.surfaces.matting import matte
 from torchdof.tensors import TRACEABLE
 
@@ -314,7 +314,7 @@ def test_surfaces_beyond_the_border_and_their_gradients_equal_the_plain_engines(
     def computed(dtype: torch.dtype) -> list[Tensor]:
         surfaces = [Surface(*(t.to(dtype).requires_grad_() for t in of_surface)) for of_surface in maps]
         bound = None if limit is None else limit.to(dtype)
-        frame = pad_to_frame(surfaces, None, nodes, 30, 4, True, True, bound, image)
+        frame = pad_to_frame(surfaces, None, nodes, Beyond(30, 4, True, bound), True, image)
         out = torch.cat([t for surface in frame.surfaces for t in surface if t is not None], 1)
         leaves = [t for surface in surfaces for t in surface if t is not None]
         total = (out * seen[..., : out.shape[-2], : out.shape[-1]]).sum()

@@ -31,7 +31,7 @@ from .layers.scatter import fold
 from .surfaces import edges
 from .surfaces.coverage import covered_by
 from .surfaces.disocclusion import behind_pixels, surfaces_of_image
-from .surfaces.frame import PaddedFrame, Surface, pad_to_frame
+from .surfaces.frame import Beyond, PaddedFrame, Surface, pad_to_frame
 
 _REACH = 4.0  # margin around an attention area, in largest blur radii; less changes its light and hidden surfaces
 _TOGETHER = 2**21  # pixels of items rendered together; larger: fewer, larger operations, and more memory
@@ -387,8 +387,8 @@ def _composite(
     coarsest = max(blur.scale for blur in blurs)
     margin = -(-max(blur.halo for blur in blurs) // coarsest) * coarsest
     behind = None if behind is None else behind_pixels(behind, size)
-    lit = options.occlusion or options.normalize
-    frame = pad_to_frame(surfaces, behind, nodes, margin, coarsest, options.occlusion, lit, limit, image)
+    beyond = Beyond(margin, coarsest, options.occlusion or options.normalize, limit)
+    frame = pad_to_frame(surfaces, behind, nodes, beyond, options.occlusion, image)
     scatter = functools.partial(convolve, turned=not options.table.is_round) if layered else fold
 
     def scattered(frame: PaddedFrame) -> Tensor:

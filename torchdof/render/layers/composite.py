@@ -121,7 +121,6 @@ def _composite_layers(frame: PaddedFrame, blurs: Sequence[LayerKernel], scatter:
     5. Upsample coarse results and put them in front of the full picture in the same way.
     6. Between the focus and the layers in front of it, put :meth:`PaddedFrame.stand_ins` in front of the picture.
     """
-    order = [k for k, occupied in enumerate(frame.occupied()) if occupied][::-1]
     light, colours, backed = frame.surfaces[0].light, frame.colours, frame.behind is not None
     each = blurs[0].kernel.shape[-3]
 
@@ -154,23 +153,8 @@ def _composite_layers(frame: PaddedFrame, blurs: Sequence[LayerKernel], scatter:
         return torch.cat(picture, 1)
 
     picture = blank(*frame.area)
-
-    # A run has one resolution and stays on one side of the focus.
-    # A group of a run has at most as many layers as fill the channels of one convolution.
-    uniform = each == 1 and blurs[0].mask is None
-    most = ops.channels // (colours + 1 + frame.occlusion) if uniform else 1
-    runs: dict[tuple[int, bool], list[list[int]]] = {}
-    before_focus = [min(places) < 0 for places in zip(*frame.nodes, strict=True)]
-    for k in order:
-        groups = runs.setdefault((blurs[k].scale, before_focus[k]), [])
-        group = groups[-1] if groups else []
-        widths = [blurs[j].kernel.shape[-1] for j in [*group, k]]
-        if group and group[-1] == k + 1 and len(group) < most and max(widths) ** 2 <= 2 * min(widths) ** 2:
-            group.append(k)
-        else:
-            groups.append([k])
     has_stand_ins = frame.occlusion and active().stand_ins
-    for (scale, is_before_focus), groups in runs.items():
+    for (scale, is_before_focus), groups in _runs(frame, blurs, ops.channels).items():
         if is_before_focus and has_stand_ins:
             has_stand_ins = False
             light, share = frame.stand_ins()
@@ -189,6 +173,26 @@ def _composite_layers(frame: PaddedFrame, blurs: Sequence[LayerKernel], scatter:
             part = ops.equal_unless(needed, together, picture)
         picture = part
     return picture
+
+
+def _runs(frame: PaddedFrame, blurs: Sequence[LayerKernel], channels: int) -> dict[tuple[int, bool], list[list[int]]]:
+    """Groups of the occupied layers, far to near, by their resolution and whether they are in front of the focus.
+
+    A group has neighbours whose kernels have similar sizes, at most as many as fill one convolution.
+    """
+    is_uniform = blurs[0].kernel.shape[-3] == 1 and blurs[0].mask is None
+    most = channels // (frame.colours + 1 + frame.occlusion) if is_uniform else 1
+    before_focus = [min(places) < 0 for places in zip(*frame.nodes, strict=True)]
+    runs: dict[tuple[int, bool], list[list[int]]] = {}
+    for k in [k for k, occupied in enumerate(frame.occupied()) if occupied][::-1]:
+        groups = runs.setdefault((blurs[k].scale, before_focus[k]), [])
+        group = groups[-1] if groups else []
+        widths = [blurs[j].kernel.shape[-1] for j in [*group, k]]
+        if group and group[-1] == k + 1 and len(group) < most and max(widths) ** 2 <= 2 * min(widths) ** 2:
+            group.append(k)
+        else:
+            groups.append([k])
+    return runs
 
 
 def raised(weight: Tensor, beyond: Tensor) -> Tensor:

@@ -276,35 +276,43 @@ def _stacked(
     return light, own, visible * (1.0 - unknown) - own
 
 
+class Beyond(NamedTuple):
+    """How a frame continues beyond the border of its image."""
+
+    margin: int
+    """Pixels added on each side."""
+    multiple: int
+    """The area is extended to multiples of this many pixels, at least a pixel of the coarsest layer."""
+    lit: bool = True
+    """Whether light is continued too; False: it is 0 there."""
+    limit: Tensor | None = None
+    """Largest light that is not a highlight, ``[B, 1, H, W]``: light above it is not continued; None: all is."""
+
+
 def pad_to_frame(
     surfaces: Sequence[Surface],
     behind: Tensor | None,
     nodes: Sequence[Sequence[float]],
-    margin: int,
-    multiple: int,
+    beyond: Beyond,
     occlusion: bool,
-    lit: bool = True,
-    limit: Tensor | None = None,
     image: int | None = 0,
 ) -> PaddedFrame:
     """Continue the surfaces of an image beyond its border to a frame (:mod:`torchdof.render.surfaces.border`).
 
     Args:
         surfaces: Near to far if stacked; else one surface, or the two that share each pixel.
-        behind: As in :class:`PaddedFrame`, as ``nodes``, ``margin`` and ``occlusion``.
+        behind: As in :class:`PaddedFrame`, as ``nodes``.
         nodes: Surfaces beyond the outermost nodes are clamped to them.
-        margin: Pixels added on each side.
-        multiple: The area is extended to multiples of this many pixels, at least a pixel of the coarsest layer.
+        beyond: How the frame continues.
         occlusion: Whether layers occlude each other.
-        lit: Whether light is continued beyond the border too; False: it is 0 there.
-        limit: Largest light that is not a highlight, ``[B, 1, H, W]``: light above it is not continued; None: all is.
         image: Index of the image's own surface; None: the surfaces are layers, each known everywhere. Unless it is 0,
             the surfaces are stacked.
     """
     size = (surfaces[0].light.shape[-2], surfaces[0].light.shape[-1])
+    margin, multiple, lit, limit = beyond
     height, width = ((n + multiple - 1) // multiple * multiple for n in size)
-    beyond = (0, width - size[1], 0, height - size[0])  # pixels added right and below, to whole blocks
-    around = (margin, margin + beyond[1], margin, margin + beyond[3])
+    to_blocks = (0, width - size[1], 0, height - size[0])  # pixels added right and below
+    around = (margin, margin + to_blocks[1], margin, margin + to_blocks[3])
     lights, cocs, weights = zip(*surfaces, strict=True)
     kept = 2 if all(weight is None for weight in weights) else 3
     whole = (torch.ones_like(cocs[0]) if weight is None else weight for weight in weights)
@@ -323,7 +331,7 @@ def pad_to_frame(
     parts = plain(*maps) if found is None else found.split([lights[0].shape[1], 1, 1] * len(surfaces), 1)
     padded = [PaddedSurface(*parts[k : k + kept]) for k in range(0, len(parts), 3)]
     if behind is not None:
-        behind = repeated(behind, beyond)
+        behind = repeated(behind, to_blocks)
     starts = ramps(nodes, padded[0].x)
     return PaddedFrame(padded, nodes, starts, behind, margin, (height, width), size, occlusion, image != 0)
 
