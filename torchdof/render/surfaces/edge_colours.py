@@ -33,7 +33,7 @@ _BRIGHTEST = 1e30  # upper limit for light; products of a few such values overfl
 
 
 class Looks(NamedTuple):
-    """Maps that tell which surface a pixel shows, as :func:`torchdof.pixels.rows`."""
+    """Maps by which the surface of a pixel is decided, as :func:`torchdof.pixels.rows`."""
 
     maps: Tensor
     """``[C + 5, B * H * W]``: square roots of light, nearness, weight as a sample, both surfaces, whether on a ramp."""

@@ -272,7 +272,7 @@ class _Map(NamedTuple):
 
 
 class _Errors(NamedTuple):
-    """What a sample of the frame tells of its map."""
+    """The errors of a map, estimated from a sample of the frame."""
 
     is_soft: Tensor  # [B, 1, 1, 1]
     sharpness: Tensor  # factor on scores, [B]
@@ -288,7 +288,7 @@ def _repair(
     """Plain PyTorch version of :func:`repair`.
 
     1. Find ramps and steps, and the nearness of both surfaces there.
-    2. From a sample of the edge pixels, tell soft maps, score the pixels by colour, and fit the prior of each kind of
+    2. From a sample of the edge pixels, detect soft maps, score the pixels by colour, and fit the prior of each kind of
        edge pixel. Select the pixels to decide: all edge pixels; with ``auto``, those of kinds that are often wrong.
     3. Decide which surface the selected pixels show, and give them its nearness, on ramps in proportion to evidence.
     4. In soft maps, remove the ringing of interpolation beside steps, and correct lamps of a few pixels.
@@ -377,7 +377,7 @@ def _decided(scene: _Map, errors: _Errors, score: Tensor, chosen: Tensor, auto: 
 
 
 def _moved(scene: _Map, errors: _Errors, shown: Shown, shows_near: Tensor, chosen: Tensor) -> Tensor:
-    """The map with the nearness of the surfaces that the pixels ``[P]`` show; in doubt, evidence counts less."""
+    """The map with the nearness of the surfaces that the pixels ``[P]`` show, on ramps by evidence or by doubt."""
     own, is_ramp, was_near = (pixels.pick(t, chosen)[0] for t in (scene.nearness, scene.edges.is_ramp, scene.is_near))
     evidence = torch.maximum(shown.evidence, scene.of_item(errors.doubt, chosen))
     if not active().third_surfaces:
@@ -434,6 +434,7 @@ def _empty(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bo
     return out, nearness.new_empty(nearness.shape[0], 1, 1, 1)
 
 
+# The number of pixels to process depends on the data, which compiled graphs do not support.
 @one_operator("torchdof::repair_edges", _empty)
 def _operator(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool) -> tuple[Tensor, Tensor]:
     repaired, doubt = _repair(image, nearness, step, auto, of_coc)
