@@ -70,7 +70,7 @@ _RELATED = 0.8  # smallest agreement of colours with the clear pixels of one sid
 _EXACT = 0.025  # largest share of wrong pixels at which the steps of a map count as exact
 _DOUBTFUL = 0.05  # share of wrong pixels of a kind above which these pixels are decided again
 _LEAN = 2.0  # log-odds by which a far surface must win: foreground left behind is the more visible error
-_TO_BLURRED = 4.5  # log-odds for a soft map's near surface that is more blurred; larger: fewer specks, less detail
+_TO_BLURRED = 3.0  # log-odds for a soft map's near surface that is more blurred; larger: fewer specks, less detail
 _BESIDE, _DIAGONAL = 1.3, 0.8  # log-odds of a neighbour's surface in soft maps; larger: smoother edges, less detail
 _DECIDED_ROUNDS = 4  # times that neighbours decide again; more: smoother edges
 
