@@ -22,7 +22,10 @@ MODULES = (
     *(f"optics/{name}" for name in ("kernel_bank", "placed_kernels", "psf")),
     *(f"render/{name}" for name in ("exposure", "highlights", "pipeline")),
     *(f"render/surfaces/{name}" for name in ("border", "disocclusion", "doubt", "edge_colours", "edge_search")),
-    *(f"render/surfaces/{name}" for name in ("edges", "emitters", "frame", "matting", "missed", "soft_maps")),
+    *(
+        f"render/surfaces/{name}"
+        for name in ("edges", "emitters", "frame", "matting", "missed", "soft_maps", "windows")
+    ),
     *(f"render/layers/{name}" for name in ("composite", "convolution", "downsampling", "field")),
     *(f"render/layers/{name}" for name in ("layer_cocs", "layer_weights", "plan")),
 )
@@ -30,7 +33,7 @@ MODULES = (
 
 SINGLE = (
     *("composite", "disocclusion", "doubt", "edge_colours", "edge_search", "edges"),
-    *("emitters", "frame", "matting", "missed", "pipeline", "soft_maps"),
+    *("emitters", "frame", "matting", "missed", "pipeline", "soft_maps", "windows"),
 )
 """Modules whose C++ computes with single precision alone: their constants are ``float``, the others' ``double``."""
 

@@ -6,6 +6,7 @@
 
 #include "api.h"
 #include "constants/doubt.h"
+#include "constants/windows.h"
 #include "entry.h"
 #include "grid.h"
 #include "rules.h"
@@ -16,6 +17,7 @@ namespace torchdof {
 namespace {
 
 using namespace constants::doubt;  // render/surfaces/doubt.py gives meanings, units and effects
+using constants::windows::LARGEST, constants::windows::NEVER;
 
 constexpr int TILE = 96;  // px; side of the squares that a thread processes at once
 

@@ -7,16 +7,16 @@
 #include <vector>
 
 #include "api.h"
-#include "constants/doubt.h"
 #include "constants/edge_search.h"
+#include "constants/windows.h"
 #include "grid.h"
 #include "threads.h"
 
 namespace torchdof {
 
-using constants::doubt::LARGEST, constants::doubt::NEVER;
 using constants::edge_search::DIRECTIONS, constants::edge_search::PLACES;
 using constants::edge_search::REACH, constants::edge_search::RINGS;
+using constants::windows::LARGEST, constants::windows::NEVER;
 constexpr int KINDS = DIRECTIONS * PLACES;
 constexpr float FINITE = 3.402823466e38f;
 constexpr int NEIGHBOURS[8][2] = {{-1, -1}, {-1, 0}, {-1, 1}, {0, -1}, {0, 1}, {1, -1}, {1, 0}, {1, 1}};

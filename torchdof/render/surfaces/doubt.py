@@ -16,9 +16,9 @@ from ...validation import engine_reads
 from ..engines.compiled_steps import by_items
 from ..engines.ops import EAGER, Ops
 from ..rules import active
-from .windows import highest, mean_around
+from .windows import LARGEST, NEVER, highest, mean_around
 
-__all__ = ["LARGEST", "NEVER", "blurred_in_doubt", "doubt_of", "hiding_px"]
+__all__ = ["blurred_in_doubt", "doubt_of", "hiding_px"]
 
 _CONTRADICTED = 0.03  # share of clear pixels that contradict the map, on either side, from which it is in doubt
 _OFTEN_CONTRADICTED = 0.045  # the same from which it is fully in doubt
@@ -32,10 +32,6 @@ _EDGE_REACH = 3  # px; distance at which surfaces on both sides of an edge are f
 _LEAST_STEP_PX = 3.0  # px; difference in coc of two surfaces from which they have an edge, by half
 _SHARPER = 0.7037  # largest blur of a pixel beyond an edge, over that of the near surface; no simple fraction
 _APART_PX = 2.0  # px; subtracted from it; larger: fewer edges
-
-# Numbers, also of the repair of edges
-LARGEST = 1e15  # largest valid nearness or coc, whose square is finite in float32
-NEVER = 1e30  # negated, replaces invalid nearness in maxima
 
 
 def hiding_px(blur_px: Tensor) -> Tensor:

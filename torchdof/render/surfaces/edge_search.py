@@ -10,8 +10,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from ..rules import active
-from .doubt import NEVER
-from .windows import highest, mean_around
+from .windows import NEVER, highest, mean_around
 
 __all__ = ["DIRECTIONS", "LEVELS", "PLACES", "REACH", "RINGS", "Edges", "ends_of", "find", "kinds", "noise"]
 

@@ -29,7 +29,7 @@ from ..layers.convolution import widest_float
 from ..rules import active
 from . import edge_search
 from .coverage import is_near_edge
-from .doubt import LARGEST, blurred_in_doubt, doubt_of
+from .doubt import blurred_in_doubt, doubt_of
 from .edge_colours import (
     CLEAR,
     CLEAR_IN_PRIOR,
@@ -44,7 +44,7 @@ from .edge_colours import (
 from .edge_search import DIRECTIONS, LEVELS, PLACES, REACH, RINGS, Edges
 from .missed import completed
 from .soft_maps import Softness, lift_lamps, sigma_of, without_ringing
-from .windows import highest
+from .windows import LARGEST, highest
 
 __all__ = ["STEP_PX", "judged", "mended", "repair", "repair_edges"]
 

@@ -8,6 +8,9 @@ from torch import Tensor
 
 from ...optics.kernel_cache import kept
 
+LARGEST = 1e15  # largest valid nearness or coc, whose square is finite in float32
+NEVER = 1e30  # negated, replaces invalid nearness in maxima
+
 
 def highest(values: Tensor, reach: int) -> Tensor:
     """The largest of the ``2 reach + 1`` by ``2 reach + 1`` values ``[B, C, H, W]`` around each, within the frame."""
