@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from tests.scenes import furry_post, wavy_post
-from torchdof import DepthOfField, blur_by_coc
+from torchdof import DepthOfField, blur_by_coc, native
 from torchdof.reference import metrics
 from torchdof.reference.degraded import degrade
 from torchdof.reference.scenes import Scene, read_scenes
+from torchdof.render.surfaces.edges import mended
 
 SCENES = {scene.name: scene for scene in read_scenes(Path(__file__).parent / "data" / "scenes")}
 MEASURED_DB = {
@@ -61,6 +62,18 @@ def test_psnr_with_degraded_depth_equals_the_recorded_values(name: str, engine: 
     scene = SCENES[name]
     pictures = [DepthOfField(scene.camera)(scene.image, degrade(scene.depth, kind)) for kind in KINDS]
     assert [psnr(picture, scene) for picture in pictures] == pytest.approx(DEGRADED_DB[name], abs=WITHIN_DB)
+
+
+@pytest.mark.skipif(not native.chosen(), reason="the compiled engine is not built here")
+@pytest.mark.parametrize("name", DEGRADED_DB)
+def test_engines_repair_soft_depth_alike(name: str) -> None:
+    scene = SCENES[name]
+    coc_px = scene.camera.coc_px(degrade(scene.depth, "half-res"), scene.image.shape[-1])
+    compiled = mended(scene.image, coc_px, "auto")
+    with native.engine_off():
+        plain = mended(scene.image, coc_px, "auto")
+    assert not compiled.equal(coc_px)
+    torch.testing.assert_close(compiled, plain, rtol=0, atol=1e-4)
 
 
 @pytest.mark.parametrize(("figure", "numbers", "recorded"), FIGURES_DB)
