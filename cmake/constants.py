@@ -22,10 +22,8 @@ MODULES = (
     *(f"optics/{name}" for name in ("kernel_bank", "placed_kernels", "psf")),
     *(f"render/{name}" for name in ("exposure", "highlights", "pipeline")),
     *(f"render/surfaces/{name}" for name in ("border", "disocclusion", "doubt", "edge_colours", "edge_search")),
-    *(
-        f"render/surfaces/{name}"
-        for name in ("edges", "emitters", "frame", "matting", "missed", "soft_maps", "windows")
-    ),
+    *(f"render/surfaces/{name}" for name in ("edges", "emitters", "frame", "matting", "missed")),
+    *(f"render/surfaces/{name}" for name in ("soft_maps", "windows")),
     *(f"render/layers/{name}" for name in ("composite", "convolution", "downsampling", "field")),
     *(f"render/layers/{name}" for name in ("layer_cocs", "layer_weights", "plan")),
 )

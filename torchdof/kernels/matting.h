@@ -8,7 +8,7 @@ using torchdof::TINY;
 using torchdof::within;
 using namespace torchdof::constants::matting;
 
-constexpr float LEAST = 1e-12f;          // smallest divisor
+constexpr float LEAST = 1e-12f;  // smallest divisor
 
 constexpr int TILE_ROWS = 4, TILE_COLUMNS = 32;  // a block of threads, as in matting.py
 constexpr int TAPS = 9, MIDDLE = TAPS / 2;       // pixels around one, row by row

@@ -301,13 +301,13 @@ def test_the_direction_of_an_edge_does_not_depend_on_rounding(moved: float) -> N
 def levels_of_a_file(count: int) -> Tensor:
     """Hills of whole numbers up to a count: differences and means of neighbours are simple fractions of each other."""
     hills = torch.rand(1, 1, 16, 24, generator=torch.Generator().manual_seed(0))
-    return count * functional.interpolate(hills, size=(96, 144), mode="bicubic")
+    return (count * functional.interpolate(hills, size=(96, 144), mode="bicubic")).round()
 
 
 @pytest.mark.parametrize("moved", [0.1, -7.0])
 @pytest.mark.parametrize("count", [40, 120])
 def test_edges_between_levels_of_a_file_do_not_depend_on_rounding(count: int, moved: float) -> None:
-    levels = levels_of_a_file(count).round()
+    levels = levels_of_a_file(count)
     found, again = (
         edge_search.find(n, n.isfinite(), step)
         for n, step in ((levels, torch.tensor(1.0)), (levels / 3 + moved, torch.tensor(1 / 3)))
@@ -321,7 +321,7 @@ def test_edges_between_levels_of_a_file_do_not_depend_on_rounding(count: int, mo
 @pytest.mark.parametrize("of_coc", [True, False])
 @pytest.mark.parametrize("count", [16, 40, 255])
 def test_engines_agree_at_every_pixel_of_a_map_of_levels(count: int, of_coc: bool) -> None:
-    levels = levels_of_a_file(count).round()
+    levels = levels_of_a_file(count)
     light = levels / count + 0.2 * torch.rand(1, 3, 96, 144)
     given = (-1.0 if of_coc else 1.0) * (0.3 * levels - 7.0)
     plain = edges._repair(light, given, torch.tensor(1.0), False, of_coc)[0]

@@ -22,7 +22,9 @@ constexpr float FINITE = 3.402823466e38f;
 constexpr int NEIGHBOURS[8][2] = {{-1, -1}, {-1, 0}, {-1, 1}, {0, -1}, {0, 1}, {1, -1}, {1, 0}, {1, 1}};
 
 // Bits of a pixel's mark. NEAR: the map gives it the near surface's depth. Bits from UNSURE up: index into SURE.
-constexpr uint8_t EDGE = 1, RAMP = 2, NEAR = 4, LISTED = 8, UNSURE = 32;
+constexpr uint8_t RAMP = 2, NEAR = 4, LISTED = 8, UNSURE = 32;
+
+inline float valid(float v) { return std::fabs(v) <= LARGEST ? v : 0.0f; }
 
 // A pixel whose surface is to be decided.
 struct Edge {
@@ -76,7 +78,6 @@ class EdgeMap : public Frame {
 
   float step(size_t i) const { return std::max(map_.steps ? map_.steps[i] : map_.step, noise_step_); }
   float nearness(size_t i) const { return sign_ * map_.nearness[i]; }
-  static float valid(float v) { return std::fabs(v) <= LARGEST ? v : 0.0f; }
 
   // Tiles that cover the frame.
   std::vector<Group> tiles() const {

@@ -233,7 +233,7 @@ class Search : EdgeMap {
       far = is_ramp > none ? -load<vec>(m.down.at(y, x)) : -far;
       const auto is_edge = (is_ramp + unsure > none) & (near - far > s) & is_valid;
       const vec is_near = 2.0f * v > near + far ? one : none;
-      const vec mark = (is_edge ? broadcast((float)EDGE) : none) + is_near * (float)NEAR + is_ramp * (float)RAMP;
+      const vec mark = is_near * (float)NEAR + is_ramp * (float)RAMP;
       const vec reference = is_valid & (is_ramp <= none) ? unsure : broadcast((float)(RINGS + 1));
       store(marks + k, (is_edge | (is_ramp > none) ? mark : none) + (float)UNSURE * reference);
       const int first = std::max(0, own.x0 - x), last = std::min(LANES, std::min(m.inner.right(), own.right()) - x);
@@ -348,9 +348,18 @@ class Search : EdgeMap {
   }
 };
 
-// Standard deviation of the map's noise, from the median second difference along rows or columns, whichever is
-// larger. At least the noise of rounding, if the map has more than LEVELS_OF_A_FILE levels; their distance is the
-// smallest difference of two neighbours.
+}  // namespace
+
+float climb(const float *value, int left, int right, int above, int below, float gap) {
+  float steepness = 0;
+  for (const int u : {left, right})
+    for (const int v : {above, below}) {
+      const float across = valid(value[u] - *value), along = valid(value[v] - *value);
+      steepness += std::sqrt(across * across + along * along);
+    }
+  return 0.25f * steepness / gap;
+}
+
 float noise_of(const torchdof_map &map) {
   const int every = (int)((2 * (int64_t)map.height * map.width + NOISE_SAMPLED - 1) / NOISE_SAMPLED);
   float quantum = INFINITY, span = 0;
@@ -379,21 +388,6 @@ float noise_of(const torchdof_map &map) {
       std::max(middle_bend(map.height, map.width, map.width, 1), middle_bend(map.width, map.height, 1, map.width));
   return std::max(NOISE_OF_BEND * bend, span > LEVELS_OF_A_FILE * quantum ? NOISE_OF_ROUNDING * quantum : 0.0f);
 }
-
-}  // namespace
-
-float climb(const float *value, int left, int right, int above, int below, float gap) {
-  const auto known = [](float change) { return std::fabs(change) <= LARGEST ? change : 0.0f; };
-  float steepness = 0;
-  for (const int u : {left, right})
-    for (const int v : {above, below}) {
-      const float across = known(value[u] - *value), along = known(value[v] - *value);
-      steepness += std::sqrt(across * across + along * along);
-    }
-  return 0.25f * steepness / gap;
-}
-
-float step_of_noise(const torchdof_map &map, float noises) { return noises * noise_of(map); }
 
 EdgeSums find_edges(const EdgeMap &map, std::vector<Group> &groups, int halo, bool expects_ramps, bool measures,
                     const KindMask &selected) {

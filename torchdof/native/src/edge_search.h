@@ -7,8 +7,10 @@
 
 namespace torchdof {
 
-// Smallest step, in standard deviations `noises` of the map's noise. edge_search.cpp
-float step_of_noise(const torchdof_map &map, float noises);
+// Standard deviation of the map's noise, from the median second difference along rows or columns, whichever is larger.
+// At least the noise of rounding, if the map has more than LEVELS_OF_A_FILE levels; their distance is the smallest
+// difference of two neighbours. edge_search.cpp
+float noise_of(const torchdof_map &map);
 
 // Finds the edges of parts, and marks the pixels up to `halo` around them; adds those of the selected kinds to the
 // groups. Returns the sums over all edge pixels if they are wanted. edge_search.cpp

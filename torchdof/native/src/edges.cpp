@@ -24,7 +24,6 @@ using namespace constants::edges;  // render/surfaces/edges.py gives meanings, u
 using constants::doubt::ASSUMED, constants::doubt::CONTRADICTED, constants::doubt::OFTEN_CONTRADICTED;
 using constants::edge_colours::SHARPNESS, constants::edge_colours::SOFT_SHARPNESS;
 using constants::edge_search::LEVELS;
-constexpr int SAMPLE_BLOCK = BLOCK;
 
 // Weights of the clearest edge pixels of far surfaces and of near ones, and of those that have the right colour.
 struct Agreement {
@@ -42,7 +41,7 @@ class Repair : Planes, EdgeMap {
  public:
   explicit Repair(const torchdof_map &map)
       : Planes((size_t)map.height * map.width), EdgeMap(map, score.data(), evidence.data(), marks.data()) {
-    noise_step_ = step_of_noise(map, NOISES);
+    noise_step_ = NOISES * noise_of(map);
   }
 
   // 1. Find the edges of a sample of the frame, see whether the map is soft, and decide by colour which surface each
@@ -133,9 +132,9 @@ class Repair : Planes, EdgeMap {
   }
 
   // Block index of a row or column, counted from the nearest border so that mirroring the frame keeps it.
-  static int block_of(int at, int size) { return std::min(at, size - 1 - at) / SAMPLE_BLOCK; }
+  static int block_of(int at, int size) { return std::min(at, size - 1 - at) / BLOCK; }
 
-  // The selected blocks of SAMPLE_BLOCK pixels.
+  // The selected blocks of BLOCK pixels.
   template <typename Wanted>
   std::vector<Group> blocks(const Wanted &wanted) const {
     struct Run {
@@ -143,8 +142,8 @@ class Repair : Planes, EdgeMap {
     };
     const auto along = [&](int size) {
       std::vector<Run> runs;
-      for (int start = 0; start < (size + 1) / 2; start += SAMPLE_BLOCK) {
-        const int near = std::min(SAMPLE_BLOCK, (size + 1) / 2 - start), far = std::min(SAMPLE_BLOCK, size / 2 - start);
+      for (int start = 0; start < (size + 1) / 2; start += BLOCK) {
+        const int near = std::min(BLOCK, (size + 1) / 2 - start), far = std::min(BLOCK, size / 2 - start);
         runs.push_back({start, near});
         if (far > 0) runs.push_back({size - start - far, far});
       }

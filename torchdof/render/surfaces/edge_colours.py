@@ -75,9 +75,9 @@ class Shown(NamedTuple):
     far: Tensor  # the same of the far surface
 
 
-def finite_light(image: Tensor) -> Tensor:
-    """Light of 0 to :data:`_BRIGHTEST`, and 0 where it is not finite."""
-    return torch.where(torch.isfinite(image), image, 0.0).clamp(0.0, _BRIGHTEST)
+def finite_light(image: Tensor, brightest: float = _BRIGHTEST) -> Tensor:
+    """Light from 0 to ``brightest``, and 0 where it is not finite."""
+    return torch.where(torch.isfinite(image), image, 0.0).clamp(0.0, brightest)
 
 
 def judge(

@@ -16,8 +16,8 @@ __all__ = ["DIRECTIONS", "LEVELS", "PLACES", "REACH", "RINGS", "Edges", "ends_of
 
 REACH = 5  # px; half the width of the window that has both surfaces of an edge, and samples of them
 
-# Steps and ramps. In a map with the levels of a file, steps, slopes and means are simple fractions of each other. Where
-# a limit is such a fraction too, rounding decides. So these limits have four digits: 0.3037 instead of 0.3.
+# Steps and ramps. In a map with the levels of a file, steps, slopes and means are simple fractions of each other. If a
+# limit were a simple fraction too, rounding would decide. So limits have four digits: 0.3037 instead of 0.3.
 RINGS = 3  # px on each side of a step that are checked; larger: corrects wider displacements
 _ABRUPT = 0.3037  # smallest jump between neighbours at a step, as a fraction of the step; larger: fewer steps
 _FLAT_REACH = 8  # px within which a ramp becomes flat; larger: more slopes count as ramps

@@ -23,6 +23,7 @@ from ..engines.ops import EAGER, Ops
 from ..engines.traced import is_compiled, one_operator
 from ..rules import active
 from .doubt import hiding_px
+from .edge_colours import finite_light
 from .windows import highest
 
 __all__ = ["completed"]
@@ -108,7 +109,7 @@ def _completed(image: Tensor, coc_px: Tensor, is_inexact: Tensor, ops: Ops) -> t
     if not is_traced() and not has_edges:
         return coc_px, coc.new_zeros(coc.shape[0], 1, 1, 1)
 
-    light = torch.where(torch.isfinite(image), image, 0.0).clamp(0.0, _BRIGHTEST).sqrt()
+    light = finite_light(image, _BRIGHTEST).sqrt()
     is_sampled = (torch.arange(coc.shape[-2], device=coc.device) % _SAMPLED == 0)[:, None]
     samples, on_surface = ((ring > _RIM) & is_sampled).to(coc.dtype), torch.where(ring > 0, coc, 0.0)
     deviation = _compared(light, on_surface, samples)[0]
