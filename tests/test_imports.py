@@ -108,6 +108,7 @@ HEAVY += ["sympy", "torch._dynamo", "torch._inductor"]  # which take a second
 FIRST = """
 import torch
 from torchdof import *
+torch.set_num_threads(2)
 dof = DepthOfField(Camera(focus_m=1.0, sensor_width_mm=4.0), BlurTable.polygon(6))
 image, depth = torch.rand(2, 3, 24, 32), 1 + torch.rand(2, 1, 24, 32).requires_grad_()
 with torch.no_grad():

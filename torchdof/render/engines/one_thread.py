@@ -64,9 +64,10 @@ class _OneThread(torch.autograd.Function):
                 inputs, out = ctx.inputs, ctx.out
             wanted = [t for t in inputs if t.requires_grad]
             keep = again or torch._C._autograd._get_current_graph_task_keep_graph()
-            found = iter(
-                torch.autograd.grad(out, wanted, gradients, retain_graph=keep, create_graph=again, allow_unused=True)
-            )
+            # of a sum: PyTorch imports sympy, which takes 0.3 s, to check gradients that it is given
+            with torch.enable_grad():
+                product = (out * gradients[0]).sum()
+            found = iter(torch.autograd.grad(product, wanted, retain_graph=keep, create_graph=again, allow_unused=True))
         if not keep:
             ctx.inputs = ctx.out = None
         return None, *(next(found) if t.requires_grad else None for t in inputs)
