@@ -31,7 +31,7 @@ MODULES = (
 
 SINGLE = (
     *("composite", "disocclusion", "doubt", "edge_colours", "edge_search", "edges"),
-    *("emitters", "frame", "matting", "missed", "pipeline", "soft_maps", "windows"),
+    *("emitters", "frame", "highlights", "matting", "missed", "pipeline", "soft_maps", "windows"),
 )
 """Modules whose C++ computes with single precision alone: their constants are ``float``, the others' ``double``."""
 

@@ -22,8 +22,9 @@ COMPILER = os.environ.get("CXX") or shutil.which("c++")
 # C++ expression of a float x or a vector v of it -> the same in Python; of 0.3 px the level is read
 RULES: dict[str, Callable[[Tensor], Tensor]] = {
     "apart_px(v, broadcast(0.7f))[0]": lambda x: matting._apart_px(x, torch.full_like(x, 0.7)),
-    "on_near(v)[0]": matting._on_near,
+    "on_near(v)[0]": matting.on_near,
     "on_far(v)[0]": matting._on_far,
+    "clamp01(unlimited_sided(v))[0]": lambda x: (matting.PLACE_SLOPE * (x - matting._SIDED_FROM)).clamp(0.0, 1.0),
     "hiding_px(x)": doubt.hiding_px,
     "end_of_surface(x)": disocclusion.end_of_surface,
     "is_another_surface(x)": disocclusion.is_another_surface,

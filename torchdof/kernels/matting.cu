@@ -224,8 +224,8 @@ __device__ inline void weight_back(const Run &r, const Pixel &p, const Split &s,
   const float off = s.covered - s.fitted, of_off = of_contradiction * 2 * off * s.strength;
   of.covered += of_off + s.by_owner(-of_cover, of_cover);
   float of_fitted = s.by_owner(-of_fit, of_fit) - of_off;
-  of.edge += of_clear * clamp01(4 * s.sided() - 2);
-  const float of_sided = within(4 * s.sided() - 2) ? 4 * of_clear * s.edge / s.gap : 0.0f;
+  of.edge += of_clear * clamp01(torchdof::unlimited_sided(s.sided()));
+  const float of_sided = within(torchdof::unlimited_sided(s.sided())) ? PLACE_SLOPE * of_clear * s.edge / s.gap : 0.0f;
   of.coc += 2 * sign(s.side) * of_sided;
   of.near -= sign(s.side) * of_sided;
   of.far -= sign(s.side) * of_sided;
@@ -302,7 +302,7 @@ extern "C" __global__ void __launch_bounds__(TILE_ROWS * TILE_COLUMNS) split_bac
     }
     const float near = torchdof::unlimited_on_near(n.nearness), far = torchdof::unlimited_on_far(n.nearness), valid = counts(r, n.pixel);
     const float of_sides = (within(near) ? of_nearer : 0.0f) - (within(far) ? of_farther : 0.0f);
-    const float of_nearness = (4 * n.unmixed * of_sides + of.covered * falloff(i, SOFTNESS_FALLOFF) * valid * s.per_counted) / s.gap;
+    const float of_nearness = (PLACE_SLOPE * n.unmixed * of_sides + of.covered * falloff(i, SOFTNESS_FALLOFF) * valid * s.per_counted) / s.gap;
     of.far += of_nearness;
     of.gap -= of_nearness * n.nearness;
     parts.at(OF_EDGE, i) = (i == MIDDLE ? of.edge : 0.0f) - falloff(i, FALLOFF) * valid * (of_nearer * clamp01(near) + of_farther * clamp01(far));

@@ -104,7 +104,7 @@ struct Same {
 __device__ inline Same same_surface(const Run &r, const Pixel &p) {
   Same s = {coc_of(r, p), edge_of(r, p), 0, 0, {}};
   TAP_BY_TAP for (int i = 0; i < TAPS; i++) s.total += s.weight(r, p.around(r, i), i);
-  s.enough = s.total - 10 * UNCLEAN;
+  s.enough = s.total - FEW_CLEAN;
   s.total = torchdof::max(s.total, LEAST);
   TAP_BY_TAP for (int i = 0; i < TAPS; i++) {
     const Pixel q = p.around(r, i);

@@ -141,7 +141,7 @@ __device__ inline Split split_of(const Run &r, const Pixel &p) {
   s.total = s.strength + TRUST * (s.seen.variance() + s.misfit) + ALIKE * ALIKE;
   s.trust = s.strength / s.total;
   s.side = (s.coc - s.ends.near) - (s.ends.far - s.coc);
-  s.clear = s.edge * clamp01(4 * s.sided() - 2);
+  s.clear = s.edge * clamp01(torchdof::unlimited_sided(s.sided()));
   s.by_fit = s.by_owner(1 - s.fitted, s.fitted);
   s.by_cover = s.by_owner(1 - s.covered, s.covered);
   s.wide = s.gap / EDGE_PX - 2;

@@ -56,7 +56,7 @@ class Blur : Frame {
     max_filter<REACH>(nearness, near, rows, beside);
     each_vector(beside, [&](int y, int x) {
       const vec nearest = max(load<vec>(near.at(y, x)), broadcast(1.0f));
-      store(is_near.at(y, x), clamp01(4.0f * load<vec>(nearness.at(y, x)) / nearest - 1.5f));
+      store(is_near.at(y, x), clamp01(NEAR_SLOPE * (load<vec>(nearness.at(y, x)) / nearest - NEAR_FROM)));
     });
     clamp_to_frame(is_near, beside);
     sums<REACH>(is_near, share, rows, part, one_over_square(REACH));

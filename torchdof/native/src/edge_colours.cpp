@@ -62,7 +62,7 @@ class Colours : EdgeMap {
         score /= total;
         for (int l = 0; l <= lane; l++) {
           Judgement &judged = group.judged[k - lane + l];
-          judged.score = std::clamp(sharpness_ * judged.reliability * score[l], -6.0f, 6.0f);
+          judged.score = std::clamp(sharpness_ * judged.reliability * score[l], -MOST_SCORE, MOST_SCORE);
           float &evidence = evidence_[group.edges[k - lane + l].i];
           evidence = std::max(clamp01(2.0f * judged.reliability * strongest[l] - 1.0f), evidence);
         }
@@ -101,7 +101,7 @@ class Colours : EdgeMap {
           for (int side = 0; side < 2; side++) {
             parts[side] += window.weights[side][n] * alike;
             if (!wants_surfaces) continue;
-            const vec part = window.weights[side][n] * (alike + 1e-3f);
+            const vec part = window.weights[side][n] * (alike + UNLIKE);
             parts[2 + side] += part;
             parts[4 + side] += part * window.values[n];
           }
@@ -199,8 +199,9 @@ class Colours : EdgeMap {
     vec spread = COLOUR_NOISE * noise + 1e-12f;
     for (int side = 0; side < 2; side++) spread += 0.5f * max(of(2 + side) * per_total[side] - from_mean[side], none);
     const vec per_light = 1.0f / (SIMILAR * square + 1e-12f), per_spread = 1.0f / (SPREAD * spread);
-    const auto is_known = (of(0) > 1e-3f) & (of(1) > 1e-3f);  // else the neighbours decide
-    const vec reliability = is_known ? max(contrast / (contrast + 0.5f * spread) - 0.1f, none) / 0.9f : one;
+    const auto is_known = (of(0) > LEAST_SEEN) & (of(1) > LEAST_SEEN);  // else the neighbours decide
+    const vec reliability =
+        is_known ? max(contrast / (contrast + 0.5f * spread) - INSEPARABLE, none) / (1.0f - INSEPARABLE) : one;
     const vec share = max(min(along / max(contrast, broadcast(1e-12f)), one), none);
     const vec unmixed = 1.0f + max(from_mean[1] - share * (2.0f * along - share * contrast), none) / spread;
     const vec mixed = wants_surfaces && map_.is_coc ? MIXTURE / (unmixed * unmixed) : none;
@@ -216,7 +217,8 @@ class Colours : EdgeMap {
     for (int l = 0; l < pixels; l++) {
       const Edge &edge = group.edges[first + l];
       score_[edge.i] =
-          is_known[l] ? std::clamp(std::log(odds[l]), -8.0f, 8.0f) * (marks_[edge.i] & RAMP ? 1.0f : clear[l]) : 0.0f;
+          is_known[l] ? std::clamp(std::log(odds[l]), -MOST_ODDS, MOST_ODDS) * (marks_[edge.i] & RAMP ? 1.0f : clear[l])
+                      : 0.0f;
       evidence_[edge.i] = likeliest[l];
       group.judged[first + l] = {0.0f, reliability[l], is_known[l] ? found.surfaces[0][l] : edge.near,
                                  is_known[l] ? found.surfaces[1][l] : edge.far};

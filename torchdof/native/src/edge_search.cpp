@@ -69,7 +69,7 @@ class Search : EdgeMap {
         for (int x = around.x0; x < around.right(); x++)
           least_step = std::min(least_step, step((size_t)y * width_ + x));
     }
-    const float change = 0.09f * least_step;
+    const float change = 0.9f * LEAST_SLOPE * least_step;
     Grid changes({0, 0, 2, around.width});
     float *of_row = changes.at(0, 0), *of_columns = changes.at(1, 0);
     changes.clear();
@@ -166,7 +166,7 @@ class Search : EdgeMap {
       each_vector(m.beside, [&](int y, int x) { any = is(y, x) ? broadcast(1.0f) : any; });
       return any_positive(any);
     };
-    const auto is_steep = [&](int y, int x) { return load<vec>(m.slope.at(y, x)) > 0.1f * steps_at(y, x); };
+    const auto is_steep = [&](int y, int x) { return load<vec>(m.slope.at(y, x)) > LEAST_SLOPE * steps_at(y, x); };
     const auto is_ramp = [&](int y, int x) { return load<vec>(m.ramp.at(y, x)) > vec{}; };
     if (any_beside(is_steep)) {
       max_filter<REACH>(m.up, m.high, m.rows, m.ramps);

@@ -202,8 +202,9 @@ class Repair : Planes, EdgeMap {
   // Whether they do on one side of its edges at least, because beside a foreground that is too thin they show the
   // foreground.
   static bool is_related(const Agreement &found) {
+    const float assumed = 0.5f * PRIOR_COUNT;  // pixels, half of which agree
     const auto agrees = [&](bool side) {
-      return (found.agreed[side] + 0.25f * PRIOR_COUNT) / (found.clear[side] + 0.5f * PRIOR_COUNT) > RELATED;
+      return (found.agreed[side] + 0.5f * assumed) / (found.clear[side] + assumed) > RELATED;
     };
     return agrees(false) || agrees(true);
   }
@@ -265,7 +266,8 @@ class Repair : Planes, EdgeMap {
         const float odds = (1.0f - share[g]) / share[g];
         const double found =
             sum_of(g * together, [&](vec weight, vec other) { return weight / (1.0f + odds * other); });
-        share[g] = std::clamp((float)((found + PRIOR_COUNT * assumed[g]) / (total + PRIOR_COUNT)), 0.005f, 0.995f);
+        share[g] = std::clamp((float)((found + PRIOR_COUNT * assumed[g]) / (total + PRIOR_COUNT)), 1.0f - MOST_SHARE,
+                              MOST_SHARE);
       }
     }
     return share;

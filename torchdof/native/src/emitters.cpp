@@ -58,21 +58,21 @@ class Around {
         if (s_.has_block(which))
           peaks_[i] = peak_of(s_.block(which).own + place_in_block(row, column), BLOCK_PIXELS, s_.channels);
       }
-    const float own_peak = light / scale, dim_below = 5.0f / std::max(own_peak, 1e-12f);
+    const float own_peak = light / scale, dim_below = DIM_SLOPE / std::max(own_peak, 1e-12f);
     float dim_sum = 0, emitter_peak = 0,
           same_peak = std::max(LEAST_PEAK * own_peak, 1e-12f);  // a ratio of tiny peaks would depend on rounding
     for (int i = 0; i < COUNT; i++) {
       const float counted = s_.valid ? s_.valid[at_[i]] : 1.0f, peak = peaks_[i] / scale, away = side * (coc_[i] - coc);
       const float same = counted * clamp01(2.0f - std::fabs(away));
       b.there[i] = side == BEHIND || touches(i) ? counted * clamp01(away - 1.0f) : 0.0f;
-      b.dim[i] = same * falloff_[i] * clamp01(2.5f - dim_below * peak);
+      b.dim[i] = same * falloff_[i] * clamp01(DIM_SLOPE * DIM_TO - dim_below * peak);
       dim_sum += b.dim[i];
       emitter_peak = std::max(emitter_peak, b.there[i] * peak);
       same_peak = std::max(same_peak, same * peak);
     }
     b.top = std::max(emitter_peak, same_peak);
-    b.certainty = clamp01(light / limit - 1.0f) * std::min(10.0f * dim_sum, 1.0f) *
-                  clamp01(10.0f * (emitter_peak / same_peak - share));
+    b.certainty = clamp01(light / limit - 1.0f) * std::min(SURE * dim_sum, 1.0f) *
+                  clamp01(SURE * (emitter_peak / same_peak - share));
     return b;
   }
 
@@ -129,7 +129,7 @@ void attribute_emitter(Job &job, int y, int x, float least_limit, const float *f
   const int i = s.block_of(y, x), within = place_in_block(y, x);
   std::vector<float> surface;
   for (const Side side : {IN_FRONT, BEHIND}) {
-    const Around::Beyond beyond = around.beyond(own_coc, side, side == IN_FRONT ? 1.0f : 0.5f, light, limit);
+    const Around::Beyond beyond = around.beyond(own_coc, side, side == IN_FRONT ? 1.0f : BEHIND_SHARE, light, limit);
     float sureness = beyond.certainty;
     if (!(sureness > 0)) continue;
     const Block block = s.make_block(i);
@@ -138,7 +138,7 @@ void attribute_emitter(Job &job, int y, int x, float least_limit, const float *f
     const float share = std::clamp((light / around.scale - floor) / std::max(beyond.top - floor, 1e-12f),
                                    1.0f - MOST_WEIGHT, MOST_WEIGHT);
     // an emitter seen behind a surface is not in front of it
-    if (side == IN_FRONT) sureness *= 1.0f - around.beyond(coc, BEHIND, 0.5f, light, limit).certainty;
+    if (side == IN_FRONT) sureness *= 1.0f - around.beyond(coc, BEHIND, BEHIND_SHARE, light, limit).certainty;
     const float given = std::max(side == IN_FRONT ? sureness : 2.0f * sureness - 1.0f, 0.0f);
     const float kept =
         std::max(side == IN_FRONT ? 1.0f - sureness : 1.0f - 2.0f * sureness, 0.0f) * block.weight[within];

@@ -25,22 +25,16 @@
 namespace torchdof {
 namespace {
 
-constexpr float FACTOR = constants::highlights::FACTOR;
-constexpr float LEAST_PX = constants::highlights::LEAST_PX;
-constexpr float NEARER_PX = constants::highlights::NEARER_PX;
-constexpr float WHOLE = constants::highlights::WHOLE;
-constexpr float DARK = constants::highlights::DARK;
-constexpr float BETWEEN_START = constants::highlights::BETWEEN_START;
-constexpr float BETWEEN_SLOPE = constants::highlights::BETWEEN_SLOPE;
-constexpr float STEP_START = constants::highlights::STEP_START;
-constexpr float STEP_SLOPE = constants::highlights::STEP_SLOPE;
-constexpr int STEP = constants::highlights::STEP;
+// Constants of highlights.py and plan.py in render, which give their meanings, units and effects.
+using constants::highlights::BETWEEN_SLOPE, constants::highlights::BETWEEN_START;
+using constants::highlights::BRIGHT_PART, constants::highlights::DARK;
+using constants::highlights::FACTOR, constants::highlights::FREE_CHANGE_PX;
+using constants::highlights::LEAST_PX, constants::highlights::NEARER_PX;
+using constants::highlights::STEP, constants::highlights::STEP_SLOPE, constants::highlights::STEP_START;
+using constants::highlights::TAPS_PER_PIXEL, constants::highlights::WHOLE;
+using constants::plan::KERNELS_PER_PX;
 constexpr int CELL_STEPS = constants::highlights::CELL;
-constexpr int BRIGHT_PART = constants::highlights::BRIGHT_PART;
-constexpr int TAPS_PER_PIXEL = constants::highlights::TAPS_PER_PIXEL;
 constexpr int THRESHOLD_CELL = STEP * CELL_STEPS;
-constexpr double FREE_CHANGE_PX = constants::highlights::FREE_CHANGE_PX;
-constexpr int KERNELS_PER_PX = constants::plan::KERNELS_PER_PX;
 constexpr int PATCH = 16;  // side in pixels of the squares in which rays are processed
 
 struct Candidate {

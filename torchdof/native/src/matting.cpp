@@ -201,7 +201,7 @@ void clean_light(const Frame &frame, int y0, int x0, Window &w, const float *fal
         weight[k] = unmixed[k] * clamp01(alike[k]);
         total += weight[k];
       }
-      const vec enough = total - 10.0f * UNCLEAN, is_clean = edge * clamp01(enough),
+      const vec enough = total - FEW_CLEAN, is_clean = edge * clamp01(enough),
                 per_total = 1.0f / max(total, broadcast(1e-12f));
       vec d_is_clean = {}, d_weight[TAPS] = {}, d_middle = {};
       for (int c = 0; c < frame.channels; c++) {
@@ -424,7 +424,7 @@ class Split {
     trust_ = strength_ / total_;
     edge_ = load<vec>(w_.edge + first_ + tap(TAPS / 2));
     sided_ = abs((here_ - ends_.near) - (ends_.far - here_)) * (1.0f / gap_);
-    clear_ = edge_ * clamp01(4.0f * sided_ - 2.0f),
+    clear_ = edge_ * clamp01(unlimited_sided(sided_)),
     contradiction_ = misfit_ + (covered_ - fitted_) * (covered_ - fitted_) * strength_;
     by_fit_ = is_near_ ? 1.0f - fitted_ : fitted_, by_cover_ = is_near_ ? 1.0f - covered_ : covered_;
     wide_ = gap_ * (1.0f / EDGE_PX) - 2.0f;
@@ -506,10 +506,10 @@ class Split {
     const vec off = covered_ - fitted_, d_off = d_contradiction * 2.0f * off * strength_;
     d_covered_ = d_off + (is_near_ ? -d_by_cover : d_by_cover);
     vec d_fitted = (is_near_ ? -d_by_fit : d_by_fit) - d_off;
-    d_edge_ = d_clear * clamp01(4.0f * sided_ - 2.0f);
+    d_edge_ = d_clear * clamp01(unlimited_sided(sided_));
     const vec signed_side = (here_ - ends_.near) - (ends_.far - here_),
               side = select(signed_side > vec{}, broadcast(1.0f)) - select(signed_side < vec{}, broadcast(1.0f));
-    const vec d_sided = select(within(4.0f * sided_ - 2.0f), d_clear * edge_ * 4.0f) / gap_;
+    const vec d_sided = select(within(unlimited_sided(sided_)), d_clear * edge_ * PLACE_SLOPE) / gap_;
     d_here_ += 2.0f * side * d_sided;
     d_near_ -= side * d_sided, d_far_ -= side * d_sided;
     d_gap_ = select(within(wide_), d_geometric * by_cover * clear_ * doubt * (1.0f / EDGE_PX)) - d_sided * sided_;
@@ -595,7 +595,8 @@ class Split {
       const vec nearness = (ends_.far - load<vec>(w_.coc + in_coc)) / gap_, to_near = unlimited_on_near(nearness),
                 to_far = unlimited_on_far(nearness);
       add(slopes.edge + first_ + tap(i), -near_by * (d_nearer[i] * clamp01(to_near) + d_farther[i] * clamp01(to_far)));
-      const vec d_ends = 4.0f * weight * (select(within(to_near), d_nearer[i]) - select(within(to_far), d_farther[i]));
+      const vec d_ends =
+          PLACE_SLOPE * weight * (select(within(to_near), d_nearer[i]) - select(within(to_far), d_farther[i]));
       const vec d_nearness = (d_ends + d_covered_ * small_[i] * per_counted_) / gap_;
       add(slopes.coc + in_coc, -d_nearness);
       d_far_ += d_nearness;
@@ -741,7 +742,8 @@ void cover_block(Job &job, int by, int bx) {
 std::vector<float> falloff_around(int reach) {
   std::vector<float> falloff;
   for (int dy = -reach; dy <= reach; dy++)
-    for (int dx = -reach; dx <= reach; dx++) falloff.push_back((float)std::exp(-(dy * dy + dx * dx) / 4.5));
+    for (int dx = -reach; dx <= reach; dx++)
+      falloff.push_back((float)std::exp(-0.5 * (dy * dy + dx * dx) / (NEAR_BY_PX * NEAR_BY_PX)));
   return falloff;
 }
 

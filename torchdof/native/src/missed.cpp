@@ -349,7 +349,7 @@ class Missed {
   // Step 4: how far the map has missed parts.
   static float missed(const Counts &counts) {
     const auto &[rim, background] = counts;
-    const double excess = (rim.share() - background.share()) / std::max(1.0 - background.share(), 0.1);
+    const double excess = (rim.share() - background.share()) / std::max(1.0 - background.share(), (double)LEAST_LIKE);
     const float share = (float)(excess * rim.all / (rim.all + constants::missed::COUNTED));
     return clamp01((share - MISSED) / (MANY_MISSED - MISSED));
   }

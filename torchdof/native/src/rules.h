@@ -20,7 +20,8 @@ using constants::doubt::APART_PX, constants::doubt::SHARPER;
 using constants::frame::AT_FOCUS, constants::frame::OFF_FOCUS, constants::frame::BARELY_BLURRED;
 using constants::frame::CONTINUES_FROM, constants::frame::COUNTED, constants::frame::HIDDEN_WEIGHT;
 using constants::frame::HIDING_SHARE, constants::frame::LEAST_PASSING, constants::frame::SEEN_FROM;
-using constants::matting::SAME_BLUR;
+using constants::matting::ON_FAR_TO, constants::matting::ON_NEAR_FROM, constants::matting::PLACE_SLOPE;
+using constants::matting::SAME_BLUR, constants::matting::SIDED_FROM;
 constexpr float FOOT = constants::layer_weights::FOOT;
 
 // Whether 0 <= v <= 1.
@@ -43,11 +44,12 @@ inline V hiding_px(V blur) {
   return (blur + APART_PX) * (1.0f / SHARPER);
 }
 
-// A pixel between two surfaces, at n from 0 at the far one to 1 at the near one, counts to the near one by clamp(4 n -
-// 2.8, 0, 1), and to the far one by clamp(1.2 - 4 n, 0, 1). render/surfaces/matting.py, _on_near and _on_far.
+// A pixel between two surfaces, at n from 0 at the far one to 1 at the near one, counts to the near one by
+// clamp(PLACE_SLOPE (n - ON_NEAR_FROM), 0, 1), and to the far one by clamp(PLACE_SLOPE (ON_FAR_TO - n), 0, 1).
+// render/surfaces/matting.py, on_near and _on_far.
 template <typename V>
 inline V unlimited_on_near(V n) {
-  return 4.0f * n - 2.8f;
+  return PLACE_SLOPE * (n - ON_NEAR_FROM);
 }
 template <typename V>
 inline V on_near(V n) {
@@ -55,11 +57,18 @@ inline V on_near(V n) {
 }
 template <typename V>
 inline V unlimited_on_far(V n) {
-  return 1.2f - 4.0f * n;
+  return PLACE_SLOPE * (ON_FAR_TO - n);
 }
 template <typename V>
 inline V on_far(V n) {
   return clamp01(unlimited_on_far(n));
+}
+
+// How far a pixel, at a distance from their middle in halves of the gap, lies on one of both: clamp(PLACE_SLOPE
+// (sided - SIDED_FROM), 0, 1). render/surfaces/matting.py, _weight_of_other.
+template <typename V>
+inline V unlimited_sided(V sided) {
+  return PLACE_SLOPE * (sided - SIDED_FROM);
 }
 
 // Largest coc of a pixel's own surface nearby, which may slope: c + max(OWN_SLOPE |c| - BEHIND_PX, 0); and its

@@ -68,8 +68,7 @@ class SoftMap : EdgeMap {
   // Raises the nearness of lamps of a few pixels, which a soft map averages with their surroundings.
   void lift_lamps(float sigma, float lost_px, float doubt) const {
     const std::vector<float> weights = even_window();
-    // 0 if the map's near surfaces are 1 px too wide: then it has lost no lamps
-    const float is_lost = clamp01(2.4f + 2.5f * lost_px) * (1.0f - doubt);
+    const float is_lost = clamp01(NONE_TOO_THIN + PER_LOST_PX * lost_px) * (1.0f - doubt);
     const std::vector<Group> all_parts = tiles();
     const int reach = blur_reach(sigma);
     parallel((int)all_parts.size(), [&](int g) {
@@ -81,7 +80,7 @@ class SoftMap : EdgeMap {
         high = max(high, load<vec>(near.at(y, x)));
         low = min(low, load<vec>(near.at(y, x)));
       });
-      if (!map_.steps && !(reduce_max(high) - reduce_min(low) > 0.5f * step(0))) return;
+      if (!map_.steps && !(reduce_max(high) - reduce_min(low) > LAMP_STEP * step(0))) return;
       const Group group{part, lamps_of(part, near)};
       if (group.edges.empty()) return;
       const Part around = bounds(group).grown(REACH), covered = around.grown(reach), whole = covered.grown(USUAL_REACH);
@@ -91,7 +90,7 @@ class SoftMap : EdgeMap {
       each_vector(covered, [&](int y, int x) {
         const vec own = load<vec>(bright.at(y, x));
         store(usual.at(y, x),
-              own > 2.0f * load<vec>(usual.at(y, x)) ? own / max(load<vec>(peak.at(y, x)), broadcast(1e-30f)) : vec{});
+              own > GLARE * load<vec>(usual.at(y, x)) ? own / max(load<vec>(peak.at(y, x)), broadcast(1e-30f)) : vec{});
       });
       clamp_to_frame(usual, covered);
       gaussian(usual, blurred, rows, around, sigma);
@@ -168,7 +167,7 @@ class SoftMap : EdgeMap {
     const float b = std::max(reduce_add(products[1]), 0.0f) / std::max(of_blurred, 1e-9f);
     const float better = clamp01((explained[1] - explained[2]) / unexplained);
     return {means[0] - b * means[1], b,
-            of_blurred > 0.004f ? clamp01((explained[1] - EXPLAINED) / EXPLAINED_MORE) * better : 0.0f};
+            of_blurred > LEAST_VARIANCE ? clamp01((explained[1] - EXPLAINED) / EXPLAINED_MORE) * better : 0.0f};
   }
 
   // bright: the brightest channel of each pixel; usual: in a part, the square of the mean of its root around the pixel.
@@ -198,7 +197,7 @@ class SoftMap : EdgeMap {
     brightest(bright, usual, rows, part);
     vec any{};
     each_vector(part, [&](int y, int x) {
-      any = max(any, load<vec>(bright.at(y, x)) > 4.0f * load<vec>(usual.at(y, x)) ? broadcast(1.0f) : vec{});
+      any = max(any, load<vec>(bright.at(y, x)) > LAMP * load<vec>(usual.at(y, x)) ? broadcast(1.0f) : vec{});
     });
     std::vector<Edge> found;
     if (!(reduce_max(any) > 0)) return found;
@@ -212,8 +211,8 @@ class SoftMap : EdgeMap {
       for (int x = part.x0; x < part.right(); x++) {
         const size_t i = (size_t)y * width_ + x;
         const float own = *bright.at(y, x);
-        if (own > 4.0f * *usual.at(y, x) && own > 0.1f * *peak.at(y, x) &&
-            *high.at(y, x) + *low.at(y, x) > 0.5f * step(i) && std::fabs(map_.nearness[i]) <= LARGEST)
+        if (own > LAMP * *usual.at(y, x) && own > LAMP_PEAK * *peak.at(y, x) &&
+            *high.at(y, x) + *low.at(y, x) > LAMP_STEP * step(i) && std::fabs(map_.nearness[i]) <= LARGEST)
           found.push_back({(int)i, 0, 0, 0});
       }
     return found;

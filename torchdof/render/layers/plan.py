@@ -26,6 +26,7 @@ _SMALL_RADII = 3.0  # blur radii: frames with a shorter side below this are plan
 _ROUGH_PX = 8.0  # mean change of coc between neighbours, in pixels, above which a frame needs fewer layers
 _ROUGH_TOLERANCE = 4.0 / 255.0  # tolerance of the roughest frames; larger: their errors exceed 1/255
 _CROWDS_FROM = 2.5  # finest distances: wider spacings get layers at crowds of the border
+_LAST_GAP = 0.3  # least distance of the outermost layer from the next one, over the usual distance
 _FARTHEST_PX = 1e9  # px: upper limit of nodes; frames are smaller
 
 _Layer = tuple[float, Tensor] | None  # place on the blur axis and kernel of a layer of one item; None: it has none
@@ -166,7 +167,7 @@ class Plan:
         The coc at the borders of these scenes is unknown, so the coarse layers, whose errors it affects, are denser.
         """
         reach, dense_from = blur_axis_of_radius(max_coc_px), blur_axis_of_radius(_COARSE_FROM_PX[0])
-        last = reach - 0.3 * layer_cocs.spacing(reach, layer_cocs.DENSE * tolerance)
+        last = reach - _LAST_GAP * layer_cocs.spacing(reach, layer_cocs.DENSE * tolerance)
         inner = [x for x in layer_cocs.spaced_nodes(-reach, reach, tolerance, dense_from) if abs(x) < last]
         return cls((-reach, *inner, reach), tolerance, rays, grows=False, kernels_per_px=_FEWER_KERNELS_PER_PX)
 
@@ -177,7 +178,7 @@ class Plan:
             return self
         nodes, scene = list(self.nodes), Plan.for_scene(coc_px, self.tolerance, adapt=False)
         for sign, last in ((-1.0, -self.nodes[0]), (1.0, self.nodes[-1])):
-            gap = 0.3 * layer_cocs.spacing(last, self.tolerance)
+            gap = _LAST_GAP * layer_cocs.spacing(last, self.tolerance)
             beyond = [sign * x for x in scene.nodes if sign * x > last]
             nodes += [sign * x for x in beyond if x > last + gap or x == max(beyond)]
         return dataclasses.replace(self, nodes=tuple(sorted(nodes)), pixels=None)

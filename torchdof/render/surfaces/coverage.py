@@ -24,6 +24,7 @@ from torch import Tensor
 from ...tensors import is_traced
 from ..engines.ops import EAGER, Ops
 from ..layers.downsampling import downsampled, upsampled
+from .matting import PLACE_SLOPE, on_near
 from .windows import highest
 
 __all__ = ["covered_by", "is_near_edge"]
@@ -31,7 +32,11 @@ __all__ = ["covered_by", "is_near_edge"]
 _LEVELS = 6  # levels of the pyramid that finds samples of one surface; larger: from farther away
 _MANY = 64  # samples from which the means of a first guess come; larger: errors of the depth matter less
 _STEP_PX = 0.5  # px; smallest difference in coc between subject and surroundings; larger: fewer edges
-_RISE = 9  # px; distance over which an edge rises by 3/10 of its step; larger: slopes count as edges
+_RISE = 9  # px; distance over which an edge rises by `_RISEN` of its step; larger: slopes count as edges
+_RISEN, _RISEN_SLOPE = 0.3, 10.0  # this part, and the slope of the certainty by it
+_BEYOND = 2.0  # place beyond both surfaces up to which a coc fits, from 0 at the other surface to 1 at its own
+_WRONG_FROM = 0.25  # place of a coc, from 0 at its own surface to 1 at the other one, above which it is wrong
+_THIRD_FROM = 3.0  # distance from the middle of both, over half the gap, from which a coc is that of a third surface
 _STEEP = 10.0  # inverse of the coverage that counts as a mixed pixel's; larger: only purer pixels are samples
 _LEAST = 1e-4  # (1 %)^2: smallest variance of a surface's light, as a fraction of its mean square
 
@@ -97,22 +102,23 @@ def _covered_by(image: Tensor, coc_px: Tensor, matte: Tensor, threshold: Callabl
     maps = torch.cat([coc, dimmed, (dimmed**2).sum(1, keepdim=True)], 1)
     guesses = [_spread(maps, weight / _MANY)[0].split([1, light.shape[1], 1], 1) for weight in pure]
     place = _place(coc, guesses[0][0], guesses[1][0])
-    fits = [(4.0 * t - 2.8).clamp(0.0, 1.0) * (8.0 - 4.0 * t).clamp(0.0, 1.0) for t in (place, 1.0 - place)]
+    fits = [on_near(t) * (PLACE_SLOPE * (_BEYOND - t)).clamp(0.0, 1.0) for t in (place, 1.0 - place)]
     samples = [weight * fit for weight, fit in zip(pure, fits, strict=True)]
     (subject, found), (beside, also_found) = (_spread(coc, weight) for weight in samples)
     place, step_px = _place(coc, subject, beside), (subject - beside).abs()
     is_subject = cover >= 0.5
     own, other = torch.where(is_subject, subject, beside), torch.where(is_subject, beside, subject)
     away = torch.where(is_subject, 1.0 - place, place).abs()  # 0: the coc is that of the larger part, 1: of the other
-    is_wrong = (4.0 * away - 1.0).clamp(0.0, 1.0)
+    is_wrong = (PLACE_SLOPE * (away - _WRONG_FROM)).clamp(0.0, 1.0)
 
     # near an edge of the matte; a wrong coc also a few pixels from it, if that of the own surface is as near
     subjects, others = (_largest(weight, _RISE) for weight in samples)
     beside_own = torch.where(is_subject, subjects, others)
     band = torch.maximum(_change(cover, 3), beside_own * is_wrong * _change(cover, _RISE)) * _STEEP
     # a third surface has its coc elsewhere; on a slope, the samples of both lie apart without an edge
-    is_edge = 10.0 * _largest_around(_change(coc.detach(), _RISE)) / step_px.clamp_min(1e-6) - 3.0
-    doubts = (band, step_px / _STEP_PX - 1.0, 3.0 - (2.0 * place - 1.0).abs(), is_edge)
+    risen = _largest_around(_change(coc.detach(), _RISE)) / step_px.clamp_min(1e-6)
+    is_third = (2.0 * place - 1.0).abs() - _THIRD_FROM
+    doubts = (band, step_px / _STEP_PX - 1.0, -is_third, _RISEN_SLOPE * (risen - _RISEN))
     certainty = torch.where(known & (found * also_found > 0), torch.stack(doubts).clamp(0.0, 1.0).prod(0), 0.0)
     moved = torch.lerp(coc, own, certainty * is_wrong)
 

@@ -25,6 +25,7 @@ _OFTEN_CONTRADICTED = 0.045  # the same from which it is fully in doubt
 _ASSUMED = 15.0  # pixels that are assumed to agree with the map; larger: maps with few edges are trusted
 _MOVED_PX = 1.0  # px; change of the coc by which the repair of edges has half moved a pixel
 _REACH = 8  # px; distance from a blurred foreground at which its blur has faded; larger: fewer scraps, softer pictures
+_NEAR_FROM, _NEAR_SLOPE = 0.375, 4.0  # blur, over the largest around, above which a pixel is near; slope of this weight
 _OF_NEAR = 0.8  # blur beside it in full doubt, over its own; larger: the same
 _LEAST_BLUR_PX = 1.5  # px; least blur at an edge in full doubt
 _AT_EDGE_PX = 2  # px; half the width of the window in which this blur fades
@@ -87,7 +88,7 @@ def _blurred(given: Tensor, repaired: Tensor, doubt: Tensor) -> Tensor:
     moved = torch.where(valid, (repaired - given).abs() / _MOVED_PX - 0.5, 0.0).clamp(0.0, 1.0)
     nearness = torch.where(valid, -repaired, -NEVER)
     near = highest(nearness, _REACH)
-    is_near = (4.0 * nearness / near.clamp_min(1.0) - 1.5).clamp(0.0, 1.0)
+    is_near = (_NEAR_SLOPE * (nearness / near.clamp_min(1.0) - _NEAR_FROM)).clamp(0.0, 1.0)
     is_beyond = (near - hiding_px(nearness.abs()) + 0.5).clamp(0.0, 1.0) * highest(moved, _REACH)
     beside = is_beyond * _OF_NEAR * near * (2.0 * mean_around(is_near, _REACH)).clamp(max=1.0)
 

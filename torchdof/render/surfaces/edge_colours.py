@@ -22,6 +22,10 @@ _SURE = (0.0, 0.02, 0.06, 0.2, 1.0)  # weight of a sample, by ring: beside a ste
 CLEAR = 0.1  # sum of these weights from which samples beside a step count in full; larger: thin strands stay
 CLEAR_IN_PRIOR = 0.25  # the same where the share of wrong pixels is estimated; larger: soft pictures stay
 _LIKELY = 0.01  # likelihood from which a ramp's pixel shows one of both surfaces; larger: more pixels stay between them
+_LEAST_SEEN = 1e-3  # sum of the weights of samples from which a surface is known
+_UNLIKE = 1e-3  # weight of samples that do not resemble a pixel, in the nearness of its surfaces
+_INSEPARABLE = 0.1  # contrast, over contrast and variance, up to which colours do not tell two surfaces apart
+_MOST_ODDS, _MOST_SCORE = 8.0, 6.0  # limits of the log-odds of a pixel, and of its score, which averages them
 _COLOUR_NOISE = 2.25e-4  # (1.5 %)^2: variance of a colour, over its square, that a surface has at least
 _MIXTURE = 0.05  # likelihood of a mixed colour on a more blurred near surface; larger: fewer outlines, less detail
 _MORE_BLURRED_PX = 2.0  # difference in blur of two surfaces from which the near one is clearly the more blurred one
@@ -115,14 +119,14 @@ def judge(
         # mean colours of both surfaces, and the variance around them
         seen = side.sum(1)
         least, total = seen.amin(0), seen + 1e-9
-        known = least > 1e-3
+        known = least > _LEAST_SEEN
         mean = (others[:, None] * side).sum(2) / total  # [C, 2, P]
         # a sum over both axes at once takes onnxruntime 35 times as long
         spread = ((others[:, None] - mean[:, :, None]).square() * side).sum(2).sum(0) / total
         noise = _COLOUR_NOISE * mean.sum(1).square().sum(0)
         spread = 0.5 * spread.sum(0) + noise + 1e-12
         contrast = (mean[:, 0] - mean[:, 1]).square().sum(0)
-        separation = (contrast / (contrast + 0.5 * spread) - 0.1).clamp_min(0.0) / 0.9
+        separation = (contrast / (contrast + 0.5 * spread) - _INSEPARABLE).clamp_min(0.0) / (1.0 - _INSEPARABLE)
         separation = torch.where(known, separation, 1.0)  # no samples in the middle of a wide ramp: neighbours decide
 
         # likelihoods
@@ -135,10 +139,10 @@ def judge(
             mixed = (1.0 + (off - share * along).square().sum(0) / spread).square().reciprocal()
             mixed = _MIXTURE * mixed * more_blurred(ends)
             likelihood = torch.stack([likelihood[0] + mixed, likelihood[1]])
-        score = torch.where(known, torch.log(likelihood[0] / likelihood[1]), 0.0).clamp(-8.0, 8.0)
+        score = torch.where(known, torch.log(likelihood[0] / likelihood[1]), 0.0).clamp(-_MOST_ODDS, _MOST_ODDS)
         if active().few_samples:
             score = torch.where(is_ramp > 0, score, score * (least / clear).clamp(max=1.0))
-        share = side * (alike + 1e-3)
+        share = side * (alike + _UNLIKE)
         surfaces = torch.where(known, (share * values).sum(1) / share.sum(1).clamp_min(1e-12), ends)
         likeliest = torch.where(known, likelihood.amax(0), 1.0)
         return torch.cat([torch.stack([score, separation, likeliest]), surfaces])
@@ -156,7 +160,7 @@ def judge(
     is_edge = ~scores.isnan()
     alike, scores = torch.where(is_edge, alike, 0.0), torch.where(is_edge, scores, 0.0)
     score = separation * (alike * scores).sum(0) / alike.sum(0).clamp_min(1e-12)
-    score = (sharpness.index_select(0, edge_pixels // like[0].numel()) * score).clamp(-6.0, 6.0)
+    score = (sharpness.index_select(0, edge_pixels // like[0].numel()) * score).clamp(-_MOST_SCORE, _MOST_SCORE)
     evidence = torch.maximum(2.0 * separation * scores.abs().amax(0) - 1.0, likeliest / _LIKELY).clamp(0.0, 1.0)
     return Shown(score, evidence, near, far)
 

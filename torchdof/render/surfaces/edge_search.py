@@ -22,6 +22,7 @@ RINGS = 3  # px on each side of a step that are checked; larger: corrects wider 
 _ABRUPT = 0.3037  # smallest jump between neighbours at a step, as a fraction of the step; larger: fewer steps
 _FLAT_REACH = 8  # px within which a ramp becomes flat; larger: more slopes count as ramps
 _RAMP_REACH = 6  # px; half the width of the widest ramp, anything wider is a slope
+_LEAST_SLOPE = 0.1  # smallest slope of a ramp per pixel, in smallest steps
 _SHALLOW = 0.0303  # smallest slope of a ramp per pixel, as a fraction of the range of nearness around
 _FLAT = 0.3037  # slope of the flattest place around a ramp, over the ramp's; larger: more slopes count as ramps
 _NEAREST = 0.6037  # a step nearer to the pixel counts from this part of the largest one around; larger: fewer rings
@@ -65,7 +66,8 @@ def find(nearness: Tensor, valid: Tensor, step: Tensor) -> Edges:
     span = highest(ends, REACH).sum(1, keepdim=True)
     # a ramp is short and has flat places around it; a slope has none
     flattest = -highest(-mean_around(slope, 2), _FLAT_REACH)
-    is_ramp = (slope > 0.1 * step) & (slope > _SHALLOW * span) & (span > step) & (flattest < _FLAT * slope) & valid
+    is_steep = (slope > _LEAST_SLOPE * step) & (slope > _SHALLOW * span)
+    is_ramp = is_steep & (span > step) & (flattest < _FLAT * slope) & valid
 
     # the surfaces at both ends of a ramp: extremes spread along it pixel by pixel
     spread = ends

@@ -63,6 +63,7 @@ _BLOCK = 8  # px; side of a block
 _TRUSTED = 0.05  # assumed share of wrong pixels beside steps
 _PRIOR_COUNT = 30.0  # weight of assumptions, in pixels; larger: the frame changes them less
 _ROUNDS = 10  # iterations of the fit
+_MOST_SHARE = 0.995  # largest share of one surface
 
 # Decision, with "auto"
 _CLEAR_LEVEL = 0.3  # distance from the middle of a ramp, in steps, from which its pixels are clear
@@ -341,7 +342,8 @@ def _errors_of(scene: _Map, auto: bool, ops: Ops) -> _Errors:
     agrees = is_clear * ((score > 0) == (level > 0.5))
     doubts, *sides = scene.sums(sampled, (1.0 - is_ramp) * pixels.pick(wrong, sampled)[0], *is_clear, *agrees)
     clear, agreed = torch.stack(sides).chunk(2)
-    is_related = (agreed + 0.25 * _PRIOR_COUNT > _RELATED * (clear + 0.5 * _PRIOR_COUNT)).any(0)
+    assumed = 0.5 * _PRIOR_COUNT  # pixels, half of which agree
+    is_related = (agreed + 0.5 * assumed > _RELATED * (clear + assumed)).any(0)
     is_soft = is_soft & is_related
     is_inexact = is_related & (is_soft | (doubts > _EXACT * steps))
     doubtful = edges.is_edge & is_inexact & torch.where(edges.is_ramp, is_soft, wrong > _DOUBTFUL)
@@ -407,7 +409,8 @@ def _calibrate(kinds: Tensor, score: Tensor, weight: Tensor, items: int) -> Tens
         change = near - far
         for _ in range(_ROUNDS):
             own = share[groups]
-            share = prior.index_add(0, groups, own / torch.addcmul(far, own, change)).clamp(0.005, 0.995)
+            share = prior.index_add(0, groups, own / torch.addcmul(far, own, change))
+            share = share.clamp(1.0 - _MOST_SHARE, _MOST_SHARE)
         return share
 
     is_step = (torch.arange(PLACES, device=device) < 2 * RINGS).repeat(items)

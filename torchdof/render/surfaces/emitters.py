@@ -8,13 +8,17 @@ from torch import Tensor
 from ... import pixels
 from ...tensors import is_empty
 from ..rules import active
-from .matting import FALLOFF, Matted, falloff
+from .matting import FALLOFF, NEAR_BY_PX, Matted
+from .windows import gaussian
 
 __all__ = ["attribute_emitters"]
 
 _EMITTER_REACH = 3  # px; half the width of the window in which an emitter's surface is searched
 _TOUCHING = 2  # px; distance over which a soft image spreads the light of an emitter in front
 _DIM = 0.1  # fraction of the highlight below which all pixels are equally good samples of a surface's own light
+_DIM_TO, _DIM_SLOPE = 0.5, 5.0  # light, over the highlight's, below which a pixel is dim; slope of its weight as one
+_SURE = 10.0  # slope of the certainty of an emitter, by the weight of dim pixels and by how far it is brighter
+_BEHIND_SHARE = 0.5  # least light of an emitter behind a surface, over the brightest of the surface
 _LEAST_PEAK = 0.5  # least peak of a surface around a highlight, as a fraction of it; larger: fewer emitters are found
 _MOST_WEIGHT = 0.98  # largest weight of an emitter on another surface in a highlight's pixel
 
@@ -117,7 +121,7 @@ def _bright_pixels(
         peaks=peaks / scale,
         coc_around=pixels.pick(coc_px, window)[0],
         counts=counts,
-        near_by=falloff(light, _EMITTER_REACH),
+        near_by=gaussian(_EMITTER_REACH, NEAR_BY_PX, light.dtype, light.device),
     )
 
 
@@ -131,12 +135,12 @@ def _found(bright: _Bright, coc: Tensor, side: float | Tensor, among: Tensor, sh
     away = side * (bright.coc_around - coc)
     there = among * (away - 1.0).clamp(0.0, 1.0)
     same = bright.counts * (2.0 - away.abs()).clamp(0.0, 1.0)
-    dim = same * bright.near_by * (2.5 - 5.0 * peaks / bright.peak.clamp_min(1e-12)).clamp(0.0, 1.0)
+    dim = same * bright.near_by * (_DIM_SLOPE * (_DIM_TO - peaks / bright.peak.clamp_min(1e-12))).clamp(0.0, 1.0)
     emitter_peak = (there * peaks).amax(0)
     same_peak = torch.maximum((same * peaks).amax(0), _LEAST_PEAK * bright.peak).clamp_min(1e-12)
     excess = (bright.peak / bright.limit - 1.0).clamp(0.0, 1.0)
-    certainty = excess * (10.0 * dim.sum(0)).clamp(max=1.0)
-    certainty = certainty * (10.0 * (emitter_peak / same_peak - share)).clamp(0.0, 1.0)
+    certainty = excess * (_SURE * dim.sum(0)).clamp(max=1.0)
+    certainty = certainty * (_SURE * (emitter_peak / same_peak - share)).clamp(0.0, 1.0)
     return _Emitter(certainty, there, dim, torch.maximum(emitter_peak, same_peak))
 
 
@@ -146,7 +150,7 @@ def _of_another_surface(bright: _Bright, parts: Matted, is_behind: bool) -> Matt
     ``parts`` are the surfaces of the pixels: light ``[C, P]``, coc and weight ``[P]``.
     """
     own, other, other_coc, weight = parts
-    side, least_share = (1.0, 0.5) if is_behind else (-1.0, 1.0)
+    side, least_share = (1.0, _BEHIND_SHARE) if is_behind else (-1.0, 1.0)
     emitter = _found(bright, bright.coc_px, side, bright.among(is_behind), least_share, bright.peaks)
     certainty, is_beyond = emitter.certainty, emitter.certainty > 0
 
@@ -157,7 +161,7 @@ def _of_another_surface(bright: _Bright, parts: Matted, is_behind: bool) -> Matt
     nearest = bright.coc_around.amin(0)
     emitter_coc = nearest + ((bright.coc_around - nearest) * lit).sum(0) / lit.sum(0).clamp_min(1e-12)
     if not is_behind:  # an emitter seen through a surface is not in front of it
-        seen_through = _found(bright, emitter_coc, 1.0, bright.counts, 0.5, bright.peaks)
+        seen_through = _found(bright, emitter_coc, 1.0, bright.counts, _BEHIND_SHARE, bright.peaks)
         certainty = certainty * (1.0 - seen_through.certainty)
     floor = surface.amax(0)
     share = (bright.peak - floor) / (emitter.peak - floor).clamp_min(1e-12)

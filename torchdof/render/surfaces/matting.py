@@ -16,17 +16,22 @@ from ...pixels import Selected
 from ..engines.compiled_steps import compiled_step
 from ..engines.ops import EAGER, Ops
 from ..rules import active
-from .windows import highest
+from .windows import gaussian, highest
 
-__all__ = ["FALLOFF", "NEVER_PX", "Matted", "falloff", "matte"]
+__all__ = ["FALLOFF", "NEAR_BY_PX", "NEVER_PX", "PLACE_SLOPE", "Matted", "matte", "on_near"]
 
 NEVER_PX = 1e9
 """A coc in pixels that no pixel has: marks the absence of a surface."""
 
 _EDGE_PX = 0.5  # px; smallest difference in coc of neighbours on two surfaces; larger: fewer edges
 _SAME_BLUR = 0.1  # difference in coc, over the smaller blur, that one surface may have as well; larger: fewer edges
-FALLOFF = math.exp(-1 / 4.5)  # weight of a neighbour at a distance of 1 px: a Gaussian of sigma 1.5
+NEAR_BY_PX = 1.5  # standard deviation of the Gaussian by which neighbours count
+FALLOFF = math.exp(-0.5 / NEAR_BY_PX**2)  # its weight at a distance of 1 px
 _UNCLEAN = 1e-2  # weight in a surface's mean colour of pixels that may be mixed; others have 1
+_FEW_CLEAN = 10 * _UNCLEAN  # sum of these weights up to which the light of unmixed pixels is unknown
+PLACE_SLOPE = 4.0  # of weights by the place between two surfaces, from 0 at the far one to 1 at the near one
+_ON_NEAR_FROM, _ON_FAR_TO = 0.7, 0.3  # place above which a pixel counts to the near one, and below which to the far one
+_SIDED_FROM = 0.5  # distance from the middle, over half the gap, above which a pixel lies on one of both surfaces
 _TRUST = 10.0  # weight of variance against contrast; larger: texture stops more splits by colour
 _TEXTURE = 50.0  # weight of variance against contrast; larger: texture keeps more of a neighbour's mixed light
 _MOST_CLEAN = 4.0  # upper limit for a neighbour's clean light, as a multiple of the brightest neighbour
@@ -186,23 +191,23 @@ def _apart_px(near_px: Tensor, far_px: Tensor) -> Tensor:
     return far_px - near_px - _SAME_BLUR * torch.minimum(near_px.abs(), far_px.abs())
 
 
-def _on_near(place: Tensor) -> Tensor:
+def on_near(place: Tensor) -> Tensor:
     """How far a pixel counts to the near one of two surfaces, at its place from 0, the far one, to 1, the near one."""
-    return (4 * place - 2.8).clamp(0, 1)
+    return (PLACE_SLOPE * (place - _ON_NEAR_FROM)).clamp(0.0, 1.0)
 
 
 def _on_far(place: Tensor) -> Tensor:
     """The same for the far surface."""
-    return (1.2 - 4 * place).clamp(0, 1)
+    return (PLACE_SLOPE * (_ON_FAR_TO - place)).clamp(0.0, 1.0)
 
 
 def _colours(edge: _EdgePixels, light: Tensor, coc_px: Tensor) -> tuple[_Colour, _Colour]:
     """Step 2 of :func:`matte`: the colours of the near and the far surface, mostly of unmixed pixels."""
     certainty = edge.chosen.put(torch.zeros_like(coc_px), edge.certainty)
-    weight = (1.0 - edge.chosen.around(certainty)[0] + _UNCLEAN) * falloff(light, 1)
+    weight = (1.0 - edge.chosen.around(certainty)[0] + _UNCLEAN) * gaussian(1, NEAR_BY_PX, light.dtype, light.device)
     weight = weight if edge.counts is None else weight * edge.counts
     nearness = edge.nearness
-    weights = weight * _on_near(nearness), weight * _on_far(nearness)
+    weights = weight * on_near(nearness), weight * _on_far(nearness)
     around = edge.around
     if active().mixed_neighbours:
         around = around - _mixed_light(around, _clean_light(edge, weight, light), *weights)
@@ -218,7 +223,7 @@ def _clean_light(edge: _EdgePixels, weight: Tensor, light: Tensor) -> Tensor:
     """
     same = weight * (2.0 - 2.0 * (edge.coc_around - edge.coc_px).abs() / _EDGE_PX).clamp(0.0, 1.0)
     mean = (edge.around * same).sum(1) / same.sum(0).clamp_min(1e-12)
-    clean = torch.lerp(edge.light, mean, edge.certainty * (same.sum(0) - 10.0 * _UNCLEAN).clamp(0.0, 1.0))
+    clean = torch.lerp(edge.light, mean, edge.certainty * (same.sum(0) - _FEW_CLEAN).clamp(0.0, 1.0))
     around = edge.chosen.around(edge.chosen.put(light, clean * edge.brightest)) / edge.brightest
     return around.clamp(-_MOST_CLEAN, _MOST_CLEAN)
 
@@ -233,11 +238,11 @@ def _weight_of_other(edge: _EdgePixels, near: _Colour, far: _Colour) -> Tensor:
     trust = strength / (strength + _TRUST * (far.variance + near.variance + misfit) + _ALIKE**2)
     # a depth between the two belongs to a steep surface, not to an edge
     sided = ((edge.coc_px - edge.near_px) - (edge.far_px - edge.coc_px)).abs() / edge.gap_px
-    clear = edge.certainty * (4.0 * sided - 2.0).clamp(0.0, 1.0)
+    clear = edge.certainty * (PLACE_SLOPE * (sided - _SIDED_FROM)).clamp(0.0, 1.0)
     by_colour = edge.by_owner(1.0 - fitted, fitted).clamp(max=0.5) * clear * trust
 
     # the near surface's share under a small Gaussian
-    small = falloff(edge.light, 1, _SOFTNESS_FALLOFF)
+    small = gaussian(1, _SOFTNESS_PX, edge.light.dtype, edge.light.device)
     small = small if edge.counts is None else small * edge.counts
     covered = (small * edge.nearness).sum(0) / small.sum(0).clamp_min(1e-12)
     by_place = edge.by_owner(1.0 - covered, covered).clamp(max=0.5) * clear * (1.0 - trust)
@@ -277,12 +282,6 @@ def _mixed_light(around: Tensor, clean: Tensor, near_weight: Tensor, far_weight:
     strength = (contrast**2).sum(0) + _TEXTURE * (far.variance + near.variance) + _ALIKE**2
     share = ((around - clean) * contrast).sum(0) / strength
     return torch.where(near_weight > far_weight, share.clamp(-1.0, 0.0), share.clamp(0.0, 1.0)) * contrast
-
-
-def falloff(light: Tensor, reach: int, beside: float = FALLOFF) -> Tensor:
-    """Gaussian weights of the pixels of a window, ``[(2 reach + 1)^2, 1]``; ``beside`` is that at 1 px."""
-    steps = range(-reach, reach + 1)
-    return light.new_tensor([beside ** (dy * dy + dx * dx) for dy in steps for dx in steps])[:, None]
 
 
 def _mean_of(colour: Tensor, weight: Tensor) -> _Colour:

@@ -40,6 +40,7 @@ _UNLIKE = 9.0  # squared deviation at which a pixel counts by half as unlike the
 _MOST_UNLIKE = 1e3  # largest deviation that is compared with `_UNLIKE`, whose square is finite
 _MISSED = 0.08  # share of unlike pixels, above that of the background, from which the map has missed parts
 _MANY_MISSED = 0.15  # the same from which near surfaces grow by `_GROWTH_PX`
+_LEAST_LIKE = 0.1  # least share of the background that is taken to be like it
 _COUNTED = 300.0  # compared pixels of a frame at which the share counts by half; larger: small edges count less
 _GROWTH_PX = 22  # px; by which near surfaces grow at most; larger: longer hairs
 _GROWTH_OVER_SMOOTH_PX = 10.0  # px; by which they grow over a smooth background
@@ -123,7 +124,7 @@ def _completed(image: Tensor, coc_px: Tensor, is_inexact: Tensor, ops: Ops) -> t
     sums = [torch.cat([part * odds / (1.0 + odds), part], 1).sum((2, 3), keepdim=True).split(1, 1) for part in parts]
     (found, count), (usual, of_usual) = sums
     usual = usual / of_usual.clamp_min(1.0)
-    excess = (found / count.clamp_min(1.0) - usual) / (1.0 - usual).clamp_min(0.1) * count / (count + _COUNTED)
+    excess = (found / count.clamp_min(1.0) - usual) / (1.0 - usual).clamp_min(_LEAST_LIKE) * count / (count + _COUNTED)
     share = ((excess - _MISSED) / (_MANY_MISSED - _MISSED)).clamp(0.0, 1.0)
     growth = _GROWTH_PX * share
     growth = torch.where(known, torch.where(is_smooth > 0, growth.clamp_min(_GROWTH_OVER_SMOOTH_PX), growth), 0.0)

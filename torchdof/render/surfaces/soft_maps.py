@@ -18,6 +18,11 @@ _CLIMBED = 0.35  # standard deviation of a ramp, as a fraction of (pixels of its
 _USUAL_REACH = 7  # px; half the width of the window of the usual light around a lamp
 _LAMP_FALLOFF_PX = 3.0  # standard deviation of the Gaussian weights of the window of a fit
 _LAMP_REACH = 2  # px; half the width of the largest lamp
+_LAMP, _GLARE = 4.0, 2.0  # light of a lamp, and of what counts to its cover, over the usual light around it
+_LAMP_PEAK = 0.1  # least light of a lamp, over the brightest in its reach
+_LAMP_STEP = 0.5  # least range of nearness around it, in smallest steps
+_NONE_TOO_THIN, _PER_LOST_PX = 2.4, 2.5  # lamps are lost with near surfaces as wide as they are; for each px too thin
+_LEAST_VARIANCE = 0.004  # of a blurred cover, from which a fit counts
 _PIXEL = 0.2  # px^2; variance that the area of a pixel adds to a ramp
 _LEAST_BLUR_PX, _MOST_BLUR_PX = 0.2, 3.0  # range of the standard deviation
 _EXPLAINED, _EXPLAINED_MORE = 0.5, 0.3  # fraction of the variance from which a fit counts; the part above, for full
@@ -85,8 +90,9 @@ def lift_lamps(light: Tensor, nearness: Tensor, repaired: Tensor, step: Tensor, 
     usual = mean_around(brightest.sqrt(), _USUAL_REACH) ** 2
     span = highest(torch.cat([nearness, -nearness], 1), REACH).sum(1, keepdim=True)
     around = highest(brightest, _LAMP_REACH)
-    is_lamp = (brightest > 4.0 * usual) & (brightest > 0.1 * around) & (span > 0.5 * step) & soft.is_soft
-    cover = torch.where(brightest > 2.0 * usual, brightest / around.clamp_min(1e-30), 0.0)
+    is_bright = (brightest > _LAMP * usual) & (brightest > _LAMP_PEAK * around)
+    is_lamp = is_bright & (span > _LAMP_STEP * step) & soft.is_soft
+    cover = torch.where(brightest > _GLARE * usual, brightest / around.clamp_min(1e-30), 0.0)
     lamp_pixels = pixels.indices(is_lamp)
     behind, difference, fit = _regress(nearness, cover, _blurred(cover, soft.sigma), lamp_pixels, ops)
     # all pixels of a lamp lie on one surface: average their fits
@@ -95,8 +101,7 @@ def lift_lamps(light: Tensor, nearness: Tensor, repaired: Tensor, step: Tensor, 
     of_lamps = pixels.put(torch.zeros_like(nearness).repeat(1, 3, 1, 1), lamp_pixels, values)
     total, level, fit = pixels.pick(of_lamps, pixels.around(lamp_pixels, nearness, _LAMP_REACH)).sum(1).unbind(0)
     level, fit = (values / total.clamp_min(1e-9) for values in (level, fit))
-    # a map whose near surfaces are not too thin has lost no lamps: 0 where they are 1 px too wide
-    is_lost = ((2.4 + 2.5 * soft.lost_px).clamp(0.0, 1.0) * (1.0 - soft.doubt)).flatten()
+    is_lost = ((_NONE_TOO_THIN + _PER_LOST_PX * soft.lost_px).clamp(0.0, 1.0) * (1.0 - soft.doubt)).flatten()
     fit = fit * is_lost[lamp_pixels // nearness[0].numel()]
     own = pixels.pick(repaired, lamp_pixels)[0]
     return pixels.put(repaired, lamp_pixels, own + fit * (level - own).clamp_min(0.0))
@@ -121,7 +126,8 @@ def _regress(
         xy = (weight * off[0] * off[1:]).sum(1).clamp_min(0.0)
         explained, unblurred = (c.square() / (v * yy).clamp_min(1e-12) for c, v in zip(xy.unbind(0), xx, strict=True))
         better = ((explained - unblurred) / (_BETTER * (1.0 - unblurred)).clamp_min(1e-6)).clamp(0.0, 1.0)
-        fit = torch.where(xx[0] > 0.004, ((explained - _EXPLAINED) / _EXPLAINED_MORE).clamp(0.0, 1.0) * better, 0.0)
+        fit = ((explained - _EXPLAINED) / _EXPLAINED_MORE).clamp(0.0, 1.0) * better
+        fit = torch.where(xx[0] > _LEAST_VARIANCE, fit, 0.0)
         b = xy[0] / xx[0].clamp_min(1e-9)
         return torch.stack([means[0] - b * means[1], b, fit])
 
