@@ -55,22 +55,6 @@ KernelMask = tuple[Tensor, Tensor, float, float | Tensor]
 fourth is not used."""
 
 
-class Spots(NamedTuple):
-    """Recipe for the kernels of n circles of confusion and C colours, as plain numbers because n is small."""
-
-    templates: list[Tensor]  # those in use, each [C, 2 cells + 3, 2 cells + 3], float32
-    which: list[tuple[int, int, int, int]]  # their indices: node below and above, and both of the next finer level
-    part: list[float]  # weight of the node above, in [0, 1]
-    finer: list[float]  # weight of the finer level, in [0, 1]
-    reach: list[list[float]]  # radius of the PSF in pixels, C for each kernel
-    fade: list[list[float]]  # weight of the kernel against a single pixel, in [0, 1], C for each kernel
-    flipped: list[bool]  # whether the kernel is point-reflected
-    half: list[int]  # half width of each kernel in pixels; light beyond it is cut off
-    moves: tuple[Tensor, Tensor] | None
-    """Zeros to add to ``part`` ``[n]`` and ``reach`` ``[n, C]``, through which gradients flow to the coc; None without
-    gradients. The engine ignores them."""
-
-
 _NUMBERS = {"int32_t": ctypes.c_int32, "int64_t": ctypes.c_int64, "float": ctypes.c_float, "double": ctypes.c_double}
 
 
@@ -475,20 +459,31 @@ def plan(coc_px: Tensor, tolerance: float) -> tuple[tuple[float, ...], float]:
         capacity = count.value
 
 
-def kernels(spots: Spots, *, squeeze: float, is_round: bool, is_even: bool) -> list[Tensor]:
+def kernels(
+    templates: list[Tensor],
+    which: list[tuple[int, int, int, int]],
+    part: list[float],
+    finer: list[float],
+    reach: list[list[float]],
+    fade: list[list[float]],
+    flipped: list[bool],
+    half: list[int],
+    *,
+    squeeze: float,
+    is_round: bool,
+    is_even: bool,
+) -> list[Tensor]:
     """Makes the kernels of a lens, ``[C, 2 half + 1, 2 half + 1]``; they sum to 1 unless they are cropped.
 
-    ``squeeze`` is the height of the blur divided by its width; a round kernel is symmetric about both axes, an even one
-    is constant within its radius.
+    The lists are those of :class:`torchdof.optics.kernel_bank.Spots`. ``squeeze`` is the height of the blur divided by
+    its width; a round kernel is symmetric about both axes, an even one is constant within its radius.
     """
-    colours = len(spots.reach[0])
-    made = [_empty(colours, 2 * half + 1, 2 * half + 1) for half in spots.half]
-    cells = [template.shape[-1] // 2 - 1 for template in spots.templates]
-    index, reach, fade = ([*itertools.chain(*each)] for each in (spots.which, spots.reach, spots.fade))
-    numbers = (spots.part, spots.finer, reach, fade, spots.flipped, spots.half)
-    scene = _API.structures["spots"](
-        len(made), colours, spots.templates, cells, index, *numbers, squeeze, is_round, is_even
-    )
+    colours = len(reach[0])
+    made = [_empty(colours, 2 * n + 1, 2 * n + 1) for n in half]
+    cells = [template.shape[-1] // 2 - 1 for template in templates]
+    index, reaches, fades = ([*itertools.chain(*each)] for each in (which, reach, fade))
+    numbers = (part, finer, reaches, fades, flipped, half, squeeze, is_round, is_even)
+    scene = _API.structures["spots"](len(made), colours, templates, cells, index, *numbers)
     _run("kernels", scene, _threads(), made)
     return made
 

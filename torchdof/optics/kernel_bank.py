@@ -23,7 +23,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..native import Spots
 from ..tensors import is_differentiated
 from . import psf
 from .kernel_cache import KernelCache
@@ -47,6 +46,22 @@ _banks: dict[str, "KernelBank"] = {}
 
 Table = Any
 """A :class:`torchdof.BlurTable`, whose module imports this one."""
+
+
+class Spots(NamedTuple):
+    """Recipe for the kernels of n circles of confusion and C colours, as plain numbers because n is small."""
+
+    templates: list[Tensor]  # those in use, each [C, 2 cells + 3, 2 cells + 3], float32
+    which: list[tuple[int, int, int, int]]  # their indices: node below and above, and both of the next finer level
+    part: list[float]  # weight of the node above, in [0, 1]
+    finer: list[float]  # weight of the finer level, in [0, 1]
+    reach: list[list[float]]  # radius of the PSF in pixels, C for each kernel
+    fade: list[list[float]]  # weight of the kernel against a single pixel, in [0, 1], C for each kernel
+    flipped: list[bool]  # whether the kernel is point-reflected
+    half: list[int]  # half width of each kernel in pixels; light beyond it is cut off
+    moves: tuple[Tensor, Tensor] | None
+    """Zeros to add to ``part`` ``[n]`` and ``reach`` ``[n, C]``, through which gradients flow to the coc; None without
+    gradients. The compiled engine ignores them."""
 
 
 class _Place(NamedTuple):

@@ -141,7 +141,7 @@ Border border_of(const Job &job, int farthest) {
       for (int at = 0; at < border.length(side); at++) {
         const int y = side >= Border::LEFT ? at : side == Border::TOP ? 0 : job.height - 1;
         const int x = side < Border::LEFT ? at : side == Border::LEFT ? 0 : job.width - 1;
-        line.x[at] = line.image_x[at] = axis(image[(size_t)y * job.width + x], low, high);
+        line.x[at] = line.image_x[at] = axis(image[job.surfaces.pixel(y, x)], low, high);
         if (!s.row(i, y, x, light.data(), coc, weight)) continue;
         line.x[at] = axis(*coc, low, high);
         const float limit = job.threshold.empty() ? INFINITY : threshold_at(job, y, x);

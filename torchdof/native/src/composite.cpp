@@ -172,6 +172,9 @@ class Composite {
   }
 
  private:
+  // Index of a pixel in the planes of a window.
+  size_t in_window(int y, int x) const { return (size_t)y * pitch_ + x; }
+
   Scratch &scratch(int worker) {
     if (!scratches_[worker]) {
       scratches_[worker].reset(new Scratch());
@@ -240,7 +243,7 @@ class Composite {
     const int k = node_before(low), columns = std::min(BLOCK, W_ - bx * BLOCK);
     if (k != node_before(high)) return false;
     for (int y = by * BLOCK; y < std::min(H_, (by + 1) * BLOCK); y++)
-      std::fill_n(&index_.intervals[0][(size_t)y * W_ + bx * BLOCK], columns, (uint16_t)k);
+      std::fill_n(&index_.intervals[0][s_.pixel(y, bx * BLOCK)], columns, (uint16_t)k);
     for (int row = by * CELLS; row < std::min((by + 1) * CELLS, index_.rows); row++)
       for (int column = bx * CELLS; column < std::min((bx + 1) * CELLS, index_.columns); column++) {
         const size_t cell = (size_t)row * index_.columns + column;
@@ -312,7 +315,7 @@ class Composite {
     const bool any = any_positive(p.most_weight);
     const int first = any ? node_before(reduce_min(p.low)) : 0, last = any ? node_before(reduce_max(p.high)) : 0;
     if (first == last) {
-      for (int y = 0; y < rows; y++) std::fill_n(intervals + (size_t)y * W_, n, (uint16_t)first);
+      for (int y = 0; y < rows; y++) std::fill_n(intervals + s_.pixel(y, 0), n, (uint16_t)first);
       if (any) mark_layers(bits, reduce_min(p.low), first), mark_layers(bits, reduce_max(p.high), first);
       return;
     }
@@ -324,7 +327,7 @@ class Composite {
         for (int k = first + 1; k <= last; k++) node -= place >= broadcast(layers_[k].at);
         store(nodes + x, node);
       }
-      for (int x = 0; x < n; x++) intervals[(size_t)y * W_ + x] = (uint16_t)nodes[x];
+      for (int x = 0; x < n; x++) intervals[s_.pixel(y, x)] = (uint16_t)nodes[x];
     }
     for (int k = first; k <= std::min(last + 1, N_ - 1); k++) {  // layer k occurs between nodes k - 1 and k + 1
       const vec before = broadcast(k == first ? -NEVER_PX : layers_[k - 1].at);
@@ -412,7 +415,7 @@ class Composite {
     p.unsorted.clear();
     p.start.assign(L + 1, 0);
     if (over_)
-      for (int y = 0; y < height; y++) memset(b.farther + (size_t)y * pitch_, 0, width * sizeof(float));
+      for (int y = 0; y < height; y++) memset(b.farther + in_window(y, 0), 0, width * sizeof(float));
     for (int y = 0; y < height; y++) {
       const int row = top + y, band = floor_div(row, per_band);
       const Pieces &pieces = d.pieces[band - d.first_band];
@@ -421,7 +424,7 @@ class Composite {
       for (int i = (int)(std::lower_bound(column + start[0], column + start[1], left) - column); i < end; i++) {
         const int node = (pieces.node[i] & ~Pieces::NORMALIZER_ONLY) - run.first + 1, x = column[i] - left;
         const float *values = &pieces.values[(size_t)i * stride];
-        if (node >= L) b.farther[(size_t)y * pitch_ + x] += values[0];
+        if (node >= L) b.farther[in_window(y, x)] += values[0];
         if (node < 0 || node >= L) continue;
         p.unsorted.push_back(
             {values, (uint16_t)y, (uint16_t)x, (uint16_t)node, (pieces.node[i] & Pieces::NORMALIZER_ONLY) != 0});
@@ -440,7 +443,7 @@ class Composite {
     const int C = C_;
     const vec at = broadcast((float)k), before = broadcast((float)(k - 1));
     for (int y = spare; y < height - spare; y++) {
-      const size_t to = (size_t)y * pitch_;
+      const size_t to = in_window(y, 0);
       const float *node = d.row(0, top + y) + left, *one = d.row(1, top + y) + left,
                   *two = d.row(C + 2, top + y) + left;
       float *share = b.term[C] + to, *normalizer = b.term[C + 1] + to;
@@ -531,7 +534,7 @@ class Composite {
     for (auto *v : {&light, &coc, &weight, &term})
       for (float *&row : *v) row = take();
     for (int by = 0; by < height; by++) {
-      const size_t to = (size_t)(first + by) * pitch_ + from;
+      const size_t to = in_window(first + by, from);
       for (int c = 0; c < C_ + 2; c++) memset(b.term[c] + to, 0, width * sizeof(float));
       for (int y = 0; y < s; y++) {
         read_row((top + by) * s + y, left * s, n, false, light.data(), coc.data(), weight.data(), b);
@@ -630,7 +633,7 @@ class Composite {
   // Marks the columns in which a layer's terms are used, in rows from `top` and columns from `left` of a window.
   void find_occupied(Scratch &b, int top, int rows, int left, int columns) const {
     for (int y = top; y < top + rows; y++) {
-      const float *share = b.term[C_] + (size_t)y * pitch_, *normalizer = b.term[C_ + 1] + (size_t)y * pitch_;
+      const float *share = b.term[C_] + in_window(y, 0), *normalizer = b.term[C_ + 1] + in_window(y, 0);
       b.occupied[y] = b.partial[y] = b.varying[y] = 0;
       for (int x = left; x < left + columns; x++) {
         const float from_one = normalizer[x] - 1.0f;
@@ -680,11 +683,11 @@ class Composite {
         if (!over_ && !has_fine(layers)) continue;  // no layer needs the places
         for (int y = w.top; y < w.top + w.rows; y++, from += j ? BLOCK : W_)
           for (int x = 0; x < BLOCK; x += LANES)
-            store(b.coc[j] + (size_t)y * pitch_ + w.column + x, index_.place(load<vec>(from + x)));
+            store(b.coc[j] + in_window(y, w.column + x), index_.place(load<vec>(from + x)));
       }
       if (!inside) {
         for (int y = w.top; y < w.top + w.rows; y++) {
-          const size_t at = (size_t)y * pitch_ + w.column;
+          const size_t at = in_window(y, w.column);
           for (size_t v = 0; v < light.size(); v++) light[v] = b.light[v] + at;
           for (int j = 0; j < s_.count; j++) coc[j] = b.coc[j] + at, weight[j] = b.weight[j] + at;
           read_row(top + y, x0, BLOCK, single, light.data(), coc.data(), weight.data(), b);
@@ -761,7 +764,7 @@ class Composite {
 
   void fill(float *term, const WindowBlock &w, float value) const {
     for (int y = w.top; y < w.top + w.rows; y++) {
-      float *row = term + (size_t)y * pitch_ + w.column;
+      float *row = term + in_window(y, w.column);
       std::fill(row, row + BLOCK, value);
     }
   }
@@ -773,7 +776,7 @@ class Composite {
                    uint32_t *varying, Scratch &b) {
     const int C = CHANNELS ? CHANNELS : C_;
     for (int y = y0; y < y1; y++) {
-      const size_t row = y - w.top, at = (size_t)y * pitch_ + w.column;
+      const size_t row = y - w.top, at = in_window(y, w.column);
       for (int x = x0; x < x1; x += LANES) {
         vec surface_share[COUNT], share = {}, normalizer = {}, p[COUNT], h[COUNT], weight[COUNT];
         for (int j = 0; j < COUNT; j++) {
@@ -866,7 +869,7 @@ class Composite {
       for (int x = 0; x < columns; x += STRIP_COLUMNS) {
         const uint32_t within = strip_inputs(from + x, l.half);
         if (!(occupied & within)) continue;
-        const size_t at = (size_t)(first + y) * pitch_ + from + x;
+        const size_t at = in_window(first + y, from + x);
         const Kernel *kernels = kernels_at(b, l, top + y, left + x);
         if (over_)
           composite_strip(b, kernels, at, first + y, within, partial & within, varying & within, y * TILE + x);
@@ -1118,7 +1121,7 @@ class Composite {
       const float *cover = b.canvas[C + (E > 1 ? c : 0)], *canvas = b.canvas[c];
       const float *added = has_rays && over_ ? traced + (size_t)c * TILE_PIXELS : nullptr;
       for (int y = 0; y < rows; y++, canvas += TILE, cover += TILE) {
-        const size_t at = ((size_t)c * H_ + y0 + y) * W_ + x0;
+        const size_t at = c * s_.area() + s_.pixel(y0 + y, x0);
         float *const to = out_ + at;
         for (int x = 0; x < columns; x += LANES) {
           vec v = load<vec>(canvas + x);
@@ -1130,7 +1133,7 @@ class Composite {
             memcpy(to + x, &v, (columns - x) * sizeof(float));
         }
         if (!s_.valid) continue;
-        const float *valid = s_.valid + (size_t)(y0 + y) * W_ + x0;
+        const float *valid = s_.valid + s_.pixel(y0 + y, x0);
         for (int x = 0; x < columns; x++)
           if (!(valid[x] > 0)) to[x] = job_.scene.light[0][at + x];
       }

@@ -200,8 +200,8 @@ class Filling {
     for (int y = y0; y <= y1; y++) {
       float *const row = row_of(y) - left;
       for (int c = 0; c < C_; c++)
-        memcpy(row + c * across, s_.light + c * s_.area() + (size_t)y * W, W * sizeof(float));
-      memcpy(row + C_ * across, s_.coc + (size_t)y * W, W * sizeof(float));
+        memcpy(row + c * across, s_.light + c * s_.area() + s_.pixel(y, 0), W * sizeof(float));
+      memcpy(row + C_ * across, s_.coc + s_.pixel(y, 0), W * sizeof(float));
       std::fill(row + (C_ + 1) * across, row + (C_ + 1) * across + W, 1.0f);
     }
     for (int block_y = y0 / BLOCK; block_y <= y1 / BLOCK; block_y++)
@@ -243,7 +243,7 @@ class Filling {
                                            : load<vec>(b.own + c * BLOCK_PIXELS + first + x));
       }
       for (int x = 0; s_.valid && x < n; x++)
-        if (!(s_.valid[(size_t)y * job_.width + x0 + x] > 0)) coc[x] = -NEVER_PX;
+        if (!(s_.valid[s_.pixel(y, x0 + x)] > 0)) coc[x] = -NEVER_PX;
     }
     if (!bright) return;
     for (int x = 0; x < n; x += LANES) {
@@ -348,7 +348,7 @@ class Filling {
 
   bool wanted(int y, int x) const {
     const int which = s_.block_of(y, x);
-    if (!(std::fabs(s_.coc[(size_t)y * job_.width + x]) > HIDING_FROM_PX)) return false;
+    if (!(std::fabs(s_.coc[s_.pixel(y, x)]) > HIDING_FROM_PX)) return false;
     return !s_.has_block(which) || s_.block(which).weight[y % BLOCK * BLOCK + x % BLOCK] < 0.5f * HIDDEN_WEIGHT;
   }
 
@@ -463,7 +463,7 @@ class Filling {
     nearest = NEVER_PX;
     for (int y = y0; y <= y1; y++)
       for (int x = x0; x <= x1; x++) {
-        nearest = std::min(nearest, s_.coc[(size_t)y * W + x]);
+        nearest = std::min(nearest, s_.coc[s_.pixel(y, x)]);
         any = any || wanted(y, x);
       }
     return any;
@@ -572,7 +572,7 @@ class Filling {
       first_rows[i] = copy_samples(to, i, y0, x0, rows, columns, planes, &to.samples[i * of_level]);
     for (int y = 0; y < rows; y++) {
       const int within = (y0 + y) % BLOCK * BLOCK + x0 % BLOCK;
-      const float *here_of = s_.coc + (size_t)(y0 + y) * W + x0;
+      const float *here_of = s_.coc + s_.pixel(y0 + y, x0);
       float cut[CELL] = {};
       if (columns < CELL) here_of = (const float *)memcpy(cut, here_of, columns * sizeof(float));
       for (int v = 0; v < VECTORS; v++) {
@@ -594,7 +594,7 @@ class Filling {
         replace(b.coc + at, mean[C]);
         vec valid = broadcast(1.0f);
         for (int x = 0; s_.valid && x < std::min(LANES, columns - v * LANES); x++)
-          valid[x] = s_.valid[(size_t)(y0 + y) * W + x0 + v * LANES + x];
+          valid[x] = s_.valid[s_.pixel(y0 + y, x0 + v * LANES + x)];
         store(b.weight + at, wanted ? hidden * valid : mixed);
       }
     }

@@ -81,7 +81,7 @@ class Blur : Frame {
         const float is_step = clamp01(*high.at(y, x) + *low.at(y, x) - LEAST_STEP_PX + 0.5f);
         const float beside = is_beyond * OF_NEAR * nearest * std::min(2.0f * *share.at(y, x), 1.0f);
         const float least = doubt_ * std::max(beside, is_step * LEAST_BLUR_PX * *fading.at(y, x));
-        if (std::fabs(own) < least) out_[(size_t)y * width_ + x] = own > 0 ? -least : least;
+        if (std::fabs(own) < least) out_[pixel(y, x)] = own > 0 ? -least : least;
       }
   }
 

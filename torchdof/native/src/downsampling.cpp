@@ -125,7 +125,7 @@ class Downsampling {
         continue;
       }
       if (!s_.row(there, y0, x0, light_of_[there].data(), coc, weight)) break;
-      const uint16_t *intervals = &index_.intervals[there][(size_t)y0 * s_.width + x0];
+      const uint16_t *intervals = &index_.intervals[there][s_.pixel(y0, x0)];
       for (int y = 0, i = 0; y < S; y++, coc += there ? BLOCK : s_.width, intervals += s_.width)
         for (int x = 0; x < WIDTH; x += LANES, i += LANES) {
           halves of_row;
@@ -148,23 +148,28 @@ class Downsampling {
       sums[0] += of.up_to * each_;
       sums[(C_ + 1) * COUNT] += of.next * each_;
     }
-    for (; column < end; column++) {  // a block's first interval goes into the planes
-      to_.row(0, row)[column] = NOWHERE;
-      for (size_t i = 0; i < cell_nodes_.size(); i++) {
-        const float *values = &cell_sums_[i * stride_ * COUNT] + column - first;
-        const bool normalizer_only = cell_nodes_[i] & Pieces::NORMALIZER_ONLY;
-        if (*values == 0 && !(normalizer_only && values[(C_ + 1) * COUNT] != 0)) continue;
-        if (normalizer_only || to_.row(0, row)[column] != NOWHERE) {
-          pieces.column.push_back(column);
-          pieces.node.push_back(cell_nodes_[i]);
-          for (int v = 0; v < stride_; v++) pieces.values.push_back(values[v * COUNT]);
-        } else {
-          to_.row(0, row)[column] = (float)cell_nodes_[i];
-          for (int v = 0; v < stride_; v++) to_.row(1 + v, row)[column] = values[v * COUNT];
-        }
+    for (; column < end; column++) put_sums<COUNT>(row, column, column - first, pieces);
+    return end;
+  }
+
+  // Puts the sums of a block, which is the n-th of its cell: its first interval into the planes, others into the
+  // pieces.
+  template <int COUNT>
+  void put_sums(int row, int column, int n, Pieces &pieces) {
+    to_.row(0, row)[column] = NOWHERE;
+    for (size_t i = 0; i < cell_nodes_.size(); i++) {
+      const float *values = &cell_sums_[i * stride_ * COUNT] + n;
+      const bool normalizer_only = cell_nodes_[i] & Pieces::NORMALIZER_ONLY;
+      if (*values == 0 && !(normalizer_only && values[(C_ + 1) * COUNT] != 0)) continue;
+      if (normalizer_only || to_.row(0, row)[column] != NOWHERE) {
+        pieces.column.push_back(column);
+        pieces.node.push_back(cell_nodes_[i]);
+        for (int v = 0; v < stride_; v++) pieces.values.push_back(values[v * COUNT]);
+      } else {
+        to_.row(0, row)[column] = (float)cell_nodes_[i];
+        for (int v = 0; v < stride_; v++) to_.row(1 + v, row)[column] = values[v * COUNT];
       }
     }
-    return end;
   }
 
   // Reads blocks of a cell that lies at least partly beyond the frame; the others get the weight 0. Beside one edge of
@@ -190,7 +195,7 @@ class Downsampling {
           const bool there = s_.row(surface, at_y, at_x, light_.data(), its_coc, its_weight);
           coc[i] = there ? *its_coc : 0.0f;
           any += weight[i] = !there ? 0.0f : its_weight ? *its_weight : 1.0f;
-          interval[i] = index_.intervals[surface][(size_t)at_y * W + at_x];
+          interval[i] = index_.intervals[surface][s_.pixel(at_y, at_x)];
           if (weight[i] == 0 || !to_.wanted[interval[i]]) continue;  // no layer needs its light
           for (int c = 0; c < C_; c++) {
             const float nearest = *light_[c];

@@ -230,8 +230,8 @@ class Colours : EdgeMap {
     const Part inside = in_frame(grid);
     for (int y = inside.y0; y < inside.bottom(); y++) {
       float *row = grid.at(y, 0);
-      const float *from = plane + (size_t)y * width_;
-      const uint8_t *marks = marks_ + (size_t)y * width_;
+      const float *from = plane + pixel(y, 0);
+      const uint8_t *marks = marks_ + pixel(y, 0);
       for (int x = inside.x0; x < inside.right(); x++) row[x] = marks[x] & LISTED ? from[x] : elsewhere;
     }
     clamp_to_frame(grid, grid);

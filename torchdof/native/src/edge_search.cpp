@@ -48,7 +48,7 @@ class Search : EdgeMap {
   void find_in(const Part &own, const Part &part, bool expects_ramps, const KindMask &selected, EdgeSums *found,
                std::vector<Edge> &edges) {
     for (int y = part.y0; y < part.bottom(); y++) {
-      const size_t i = (size_t)y * width_ + part.x0;
+      const size_t i = pixel(y, part.x0);
       const float *values = map_.nearness + i;
       uint8_t *marks = marks_ + i;
       for (int x = 0; x < part.width; x++) marks[x] = std::fabs(values[x]) <= LARGEST ? 0 : (RINGS + 1) * UNSURE;
@@ -66,8 +66,7 @@ class Search : EdgeMap {
     if (map_.steps) {
       least_step = NEVER;
       for (int y = around.y0; y < around.bottom(); y++)
-        for (int x = around.x0; x < around.right(); x++)
-          least_step = std::min(least_step, step((size_t)y * width_ + x));
+        for (int x = around.x0; x < around.right(); x++) least_step = std::min(least_step, step(pixel(y, x)));
     }
     const float change = 0.9f * LEAST_SLOPE * least_step;
     Grid changes({0, 0, 2, around.width});
@@ -75,7 +74,7 @@ class Search : EdgeMap {
     changes.clear();
     int top = height_, bottom = 0;
     for (int y = around.y0; y < around.bottom(); y++) {
-      const float *at = map_.nearness + (size_t)y * width_ + around.x0, *above = y > around.y0 ? at - width_ : at;
+      const float *at = map_.nearness + pixel(y, around.x0), *above = y > around.y0 ? at - width_ : at;
       for (int x = 0; x < around.width - 1; x++) {
         const float beside = std::fabs(at[x + 1] - at[x]), below = std::fabs(at[x] - above[x]);
         const float known = beside > 0 ? beside : 0.0f;  // a change next to NaN counts as 0
@@ -142,7 +141,7 @@ class Search : EdgeMap {
     std::vector<float> marks_of_row(inner.width + LANES);
     for (int y = inner.y0; y < inner.bottom(); y++) {
       find_in_row(m, own, y, selected, found, edges, marks_of_row.data());
-      uint8_t *marks = marks_ + (size_t)y * width_ + inner.x0;
+      uint8_t *marks = marks_ + pixel(y, inner.x0);
       for (int k = 0; k < inner.width; k++) marks[k] = (uint8_t)(int)marks_of_row[k];
     }
     return true;
@@ -152,7 +151,7 @@ class Search : EdgeMap {
   vec steps_at(int y, int x) const {
     if (!map_.steps) return broadcast(step(0));
     vec steps = {};
-    const float *row = map_.steps + (size_t)std::clamp(y, 0, height_ - 1) * width_;
+    const float *row = map_.steps + pixel(std::clamp(y, 0, height_ - 1), 0);
     for (int i = 0; i < LANES; i++) steps[i] = row[std::clamp(x + i, 0, width_ - 1)];
     return max(steps, broadcast(noise_step_));
   }

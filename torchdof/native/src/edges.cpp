@@ -75,9 +75,8 @@ class Repair : Planes, EdgeMap {
     calibrate(sampled);
     const Agreement agreement = agreement_of(sampled);
     if (map_.automatic && (!is_related(agreement) || !(is_soft || is_inexact(sampled)))) return false;
-    parallel(height_, [&](int y) {
-      memcpy(map_.out + (size_t)y * width_, map_.nearness + (size_t)y * width_, width_ * sizeof(float));
-    });
+    parallel(height_,
+             [&](int y) { memcpy(map_.out + pixel(y, 0), map_.nearness + pixel(y, 0), width_ * sizeof(float)); });
     const KindMask doubtful = map_.automatic ? doubtful_kinds(is_soft) : all_kinds;
     if (finds_twice)
       found_ = find_edges(*this, groups, 0, is_soft, is_soft, doubtful);

@@ -111,7 +111,7 @@ class Around {
 // The highlight threshold of a pixel, if its light is above it; else 0.
 float limit_of_highlight(const Job &job, int y, int x, float light, float least_limit) {
   const Surfaces &s = job.surfaces;
-  if (!(light > least_limit) || (s.valid && !(s.valid[(size_t)y * s.width + x] > 0))) return 0.0f;
+  if (!(light > least_limit) || (s.valid && !(s.valid[s.pixel(y, x)] > 0))) return 0.0f;
   const float limit = threshold_at(job, y, x);
   return light > limit ? limit : 0.0f;
 }
@@ -121,7 +121,7 @@ float limit_of_highlight(const Job &job, int y, int x, float light, float least_
 void attribute_emitter(Job &job, int y, int x, float least_limit, const float *falloff) {
   Surfaces &s = job.surfaces;
   const int channels = job.channels;
-  const size_t at = (size_t)y * s.width + x, area = s.area();
+  const size_t at = s.pixel(y, x), area = s.area();
   const float light = peak_of(s.light + at, area, channels), own_coc = s.coc[at];
   const float limit = limit_of_highlight(job, y, x, light, least_limit);
   if (!(limit > 0)) return;
@@ -157,7 +157,7 @@ void attribute_emitter(Job &job, int y, int x, float least_limit, const float *f
 float weight_left(const Job &job, int y, int x, float least_limit, const float *falloff) {
   const Surfaces &s = job.surfaces;
   const int i = s.block_of(y, x), within = place_in_block(y, x);
-  const size_t at = (size_t)y * s.width + x;
+  const size_t at = s.pixel(y, x);
   const float light = peak_of(s.light + at, s.area(), s.channels),
               limit = limit_of_highlight(job, y, x, light, least_limit);
   const Block block = s.block(i);

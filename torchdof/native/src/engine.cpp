@@ -106,7 +106,7 @@ void Job::clean_inputs() {
   clean_light = Buffer<float>(bad ? area * channels : 0);
   validity = Buffer<float>(bad ? area : 0);
   parallel(height, [&](int y, int) {
-    for (size_t i = (size_t)y * width; i < (size_t)(y + 1) * width; i++) {
+    for (size_t i = surfaces.pixel(y, 0); i < surfaces.pixel(y + 1, 0); i++) {
       bool valid = true;
       if (bad) {
         valid = std::isfinite(surfaces.coc[i]);
@@ -157,7 +157,7 @@ void Job::copy_masked_blocks() {
     bool whole = true;
     const int y0 = i / surfaces.block_columns * BLOCK, x0 = i % surfaces.block_columns * BLOCK;
     for (int y = y0; y < std::min(height, y0 + BLOCK); y++)
-      for (int x = x0; x < std::min(width, x0 + BLOCK); x++) whole &= surfaces.valid[(size_t)y * width + x] > 0;
+      for (int x = x0; x < std::min(width, x0 + BLOCK); x++) whole &= surfaces.valid[surfaces.pixel(y, x)] > 0;
     if (!whole) surfaces.make_block(i);
   }
 }

@@ -95,6 +95,9 @@ class Frame {
  protected:
   Frame(int height, int width) : height_(height), width_(width), area_((size_t)height * width) {}
 
+  // Index of a pixel in a plane of the frame.
+  size_t pixel(int y, int x) const { return (size_t)y * width_ + x; }
+
   Part in_frame(const Part &part) const {
     const int y0 = std::max(0, part.y0), x0 = std::max(0, part.x0);
     return {y0, x0, std::min(height_, part.bottom()) - y0, std::min(width_, part.right()) - x0};

@@ -116,7 +116,7 @@ void Job::find_threshold() {
       const int y = mirrored(row * THRESHOLD_CELL + i * STEP + STEP / 2 - threshold_top, height);
       for (int column = 0; column < threshold_columns; column++)
         for (int j = 0; j < CELL_STEPS; j++) {
-          const size_t at = (size_t)y * width + xs[column * CELL_STEPS + j];
+          const size_t at = surfaces.pixel(y, xs[column * CELL_STEPS + j]);
           brightest[(size_t)column * VECTORS * LANES + i * CELL_STEPS + j] =
               valid && !(valid[at] > 0) ? INFINITY : peak_of(light + at, area, channels);
         }
@@ -136,7 +136,7 @@ static float part_sent(const Surfaces &surfaces, int channels, int second, int y
   const Block block = surfaces.block(surfaces.block_of(y, x));
   const int within = place_in_block(y, x);
   const float cover = (second ? block.weight : block.own_weight)[within];
-  const float gap = coc - (second ? surfaces.coc[(size_t)y * surfaces.width + x] : block.coc[within]);
+  const float gap = coc - (second ? surfaces.coc[surfaces.pixel(y, x)] : block.coc[within]);
   const float stopped = clamp01(gap - NEARER_PX);
   if (!(stopped > 0)) return cover;
   const float middle = coc - 0.5f * gap;

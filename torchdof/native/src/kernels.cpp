@@ -196,23 +196,24 @@ class Maker {
   // raises negative values to 0. Their four neighbours give the light for this, in proportion to their own.
   void settle(int n) {
     const int pitch = n + 2;
+    const auto in = [pitch](int y, int x) { return (size_t)y * pitch + x; };  // index in planes with a margin of 1
     positive_.assign((size_t)pitch * pitch, 0.0f);
     rate_.assign(positive_.size(), 0.0f);
     settled_.resize((size_t)n * n);
     auto mirror = [&](std::vector<float> &values) {  // fills the values before the centre of a symmetric kernel
       if (!folded_) return;
       for (int k = 0; k < pitch; k++) values[k] = values[2 * pitch + k];
-      for (int k = 0; k < pitch; k++) values[(size_t)k * pitch] = values[(size_t)k * pitch + 2];
+      for (int k = 0; k < pitch; k++) values[in(k, 0)] = values[in(k, 2)];
     };
     for (int y = 0; y < n; y++)
       for (int x = 0; x < n; x++) {
         float &value = kernel_[(size_t)y * n + x];
         value = std::min(value, 2 * std::max(at_most_[(size_t)y * n + x], 0.0f));
-        positive_[(size_t)(y + 1) * pitch + x + 1] = std::max(value, 0.0f);
+        positive_[in(y + 1, x + 1)] = std::max(value, 0.0f);
       }
     mirror(positive_);
     auto around = [&](const std::vector<float> &values, int y, int x) {
-      const float *p = &values[(size_t)(y + 1) * pitch + x + 1];
+      const float *p = &values[in(y + 1, x + 1)];
       return p[-pitch] + p[pitch] + p[-1] + p[1];
     };
     for (int y = 0; y < n; y++)
@@ -220,13 +221,12 @@ class Maker {
         const float owed = -kernel_[(size_t)y * n + x];
         if (!(owed > 0)) continue;
         const float have = around(positive_, y, x);
-        if (have > 0) rate_[(size_t)(y + 1) * pitch + x + 1] = owed / have;
+        if (have > 0) rate_[in(y + 1, x + 1)] = owed / have;
       }
     mirror(rate_);
     for (int y = 0; y < n; y++)
       for (int x = 0; x < n; x++)
-        settled_[(size_t)y * n + x] =
-            std::max(positive_[(size_t)(y + 1) * pitch + x + 1] * (1 - around(rate_, y, x)), 0.0f);
+        settled_[(size_t)y * n + x] = std::max(positive_[in(y + 1, x + 1)] * (1 - around(rate_, y, x)), 0.0f);
   }
 
   const torchdof_spots &s_;

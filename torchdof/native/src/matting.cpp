@@ -53,6 +53,7 @@ struct Frame {
   const float *darkest, *brightest;  // range of the light of each channel
 
   size_t area() const { return (size_t)height * width; }
+  size_t pixel(int y, int x) const { return (size_t)y * width + x; }  // its index in a plane
 };
 
 struct Window {
@@ -170,6 +171,23 @@ struct Ends {
   }
 };
 
+// Which of the pixels around those at `at` of a window belong to the same surface: weights and their parts.
+struct SameSurface {
+  vec near_by[TAPS], unmixed[TAPS], alike[TAPS], apart[TAPS], weight[TAPS], total = {};
+
+  SameSurface(const Frame &frame, const Window &w, int at, const float *falloff) {
+    const vec coc = load<vec>(w.coc + at + tap(TAPS / 2));  // the window of coc has one more pixel before
+    for (int k = 0; k < TAPS; k++) {
+      apart[k] = (load<vec>(w.coc + at + tap(k)) - coc) * (1.0f / EDGE_PX);
+      near_by[k] = frame.valid ? falloff[k] * load<vec>(w.valid + at + tap(k)) : broadcast(falloff[k]);
+      unmixed[k] = (broadcast(1.0f + UNCLEAN) - load<vec>(w.edge + at - PITCH - 1 + tap(k))) * near_by[k];
+      alike[k] = 2.0f - 2.0f * abs(apart[k]);
+      weight[k] = unmixed[k] * clamp01(alike[k]);
+      total += weight[k];
+    }
+  }
+};
+
 // Replaces the light of mixed pixels by the mean of the unmixed pixels of the same surface around them. With `slopes`:
 // adds the gradients by clean light to those by light, edges and coc instead.
 void clean_light(const Frame &frame, int y0, int x0, Window &w, const float *falloff, Slopes *slopes = nullptr) {
@@ -184,30 +202,21 @@ void clean_light(const Frame &frame, int y0, int x0, Window &w, const float *fal
     w.clean = w.light;
   for (int i = 1; i < EDGES - 1; i++)
     for (int j = 1; j < EDGES - 1; j += LANES) {
-      const int at = i * PITCH + j, first = at - PITCH - 1,
-                middle = tap(TAPS / 2);  // the window of coc has one more pixel before
-      const vec edge = load<vec>(w.edge + at), coc = load<vec>(w.coc + at + middle);
+      const int at = i * PITCH + j, first = at - PITCH - 1;
+      const vec edge = load<vec>(w.edge + at);
       if (!any_of(edge > vec{})) {
         for (int c = 0; slopes && c < frame.channels; c++)
           add(&slopes->light[c * plane + at], load<vec>(&slopes->clean[c * plane + at]));
         continue;
       }
-      vec near_by[TAPS], unmixed[TAPS], alike[TAPS], apart[TAPS], weight[TAPS], total = {};
-      for (int k = 0; k < TAPS; k++) {
-        apart[k] = (load<vec>(w.coc + at + tap(k)) - coc) * (1.0f / EDGE_PX);
-        near_by[k] = frame.valid ? falloff[k] * load<vec>(w.valid + at + tap(k)) : broadcast(falloff[k]);
-        unmixed[k] = (broadcast(1.0f + UNCLEAN) - load<vec>(w.edge + first + tap(k))) * near_by[k];
-        alike[k] = 2.0f - 2.0f * abs(apart[k]);
-        weight[k] = unmixed[k] * clamp01(alike[k]);
-        total += weight[k];
-      }
-      const vec enough = total - FEW_CLEAN, is_clean = edge * clamp01(enough),
-                per_total = 1.0f / max(total, broadcast(1e-12f));
+      const SameSurface same(frame, w, at, falloff);
+      const vec enough = same.total - FEW_CLEAN, is_clean = edge * clamp01(enough),
+                per_total = 1.0f / max(same.total, broadcast(1e-12f));
       vec d_is_clean = {}, d_weight[TAPS] = {}, d_middle = {};
       for (int c = 0; c < frame.channels; c++) {
         const float *const light = &w.light[c * plane];
         vec sum = {};
-        for (int k = 0; k < TAPS; k++) sum += weight[k] * load<vec>(light + first + tap(k));
+        for (int k = 0; k < TAPS; k++) sum += same.weight[k] * load<vec>(light + first + tap(k));
         const vec mean = sum * per_total, here = load<vec>(light + at);
         if (!slopes) {
           store(&w.clean[c * plane + at], here + is_clean * (mean - here));
@@ -218,20 +227,20 @@ void clean_light(const Frame &frame, int y0, int x0, Window &w, const float *fal
         add(&slopes->light[c * plane + at], slope - slope * is_clean);
         for (int k = 0; k < TAPS; k++) {
           d_weight[k] += d_mean * (load<vec>(light + first + tap(k)) - mean);
-          add(&slopes->light[c * plane + first + tap(k)], d_mean * weight[k]);
+          add(&slopes->light[c * plane + first + tap(k)], d_mean * same.weight[k]);
         }
       }
       if (!slopes) continue;
       add(slopes->edge + at, d_is_clean * clamp01(enough));
       for (int k = 0; k < TAPS; k++) {
         const vec slope = d_weight[k] + select(within(enough), d_is_clean * edge);
-        add(slopes->edge + first + tap(k), -slope * clamp01(alike[k]) * near_by[k]);
-        const vec d_apart = select(within(alike[k]), slope * unmixed[k] * (-2.0f / EDGE_PX)) *
-                            (select(apart[k] > vec{}, broadcast(1.0f)) - select(apart[k] < vec{}, broadcast(1.0f)));
+        add(slopes->edge + first + tap(k), -slope * clamp01(same.alike[k]) * same.near_by[k]);
+        const vec d_apart =
+            select(within(same.alike[k]), slope * same.unmixed[k] * (-2.0f / EDGE_PX)) * sign(same.apart[k]);
         add(slopes->coc + at + tap(k), d_apart);
         d_middle -= d_apart;
       }
-      add(slopes->coc + at + middle, d_middle);
+      add(slopes->coc + at + tap(TAPS / 2), d_middle);
     }
   for (int c = 0; !slopes && c < frame.channels; c++)
     each_outside(frame, y0, x0, [&](int from, int to) { w.clean[c * plane + from] = w.clean[c * plane + to]; });
@@ -507,8 +516,7 @@ class Split {
     d_covered_ = d_off + (is_near_ ? -d_by_cover : d_by_cover);
     vec d_fitted = (is_near_ ? -d_by_fit : d_by_fit) - d_off;
     d_edge_ = d_clear * clamp01(unlimited_sided(sided_));
-    const vec signed_side = (here_ - ends_.near) - (ends_.far - here_),
-              side = select(signed_side > vec{}, broadcast(1.0f)) - select(signed_side < vec{}, broadcast(1.0f));
+    const vec side = sign((here_ - ends_.near) - (ends_.far - here_));
     const vec d_sided = select(within(unlimited_sided(sided_)), d_clear * edge_ * PLACE_SLOPE) / gap_;
     d_here_ += 2.0f * side * d_sided;
     d_near_ -= side * d_sided, d_far_ -= side * d_sided;
@@ -542,7 +550,12 @@ class Split {
     vec d_nearer[TAPS] = {}, d_farther[TAPS] = {};
     back_of_mean(light_, nearer_, front_, near_variance_, d_front_, d_variance_, d_light_, d_nearer);
     back_of_mean(light_, farther_, behind_, far_variance_, d_behind_, d_variance_, d_light_, d_farther);
+    back_of_clean_colours(d_nearer, d_farther);
+    back_of_taps(d_nearer, d_farther, slopes);
+  }
 
+  // The gradients by the colours of clean light, and from there by the weights of both surfaces.
+  void back_of_clean_colours(vec *d_nearer, vec *d_farther) {
     // light -= shift contrast, shift = per_strength sum((light - clean) contrast), of the clean colours
     vec d_per_strength = {};
     std::fill(d_contrast_, d_contrast_ + C(), vec{});
@@ -576,7 +589,10 @@ class Split {
                  d_nearer);
     back_of_mean(clean_, farther_, clean_behind_, clean_far_variance_, d_behind_, TEXTURE * d_strength, d_clean_,
                  d_farther);
+  }
 
+  // Adds the gradients by the pixels of the window, from those by the weights of both surfaces.
+  void back_of_taps(const vec *d_nearer, const vec *d_farther, Slopes &slopes) {
     const vec per_scale = 1.0f / scale_;
     for (int c = 0; c < C(); c++) {
       d_light_[c * TAPS + TAPS / 2] += d_colour_[c];
@@ -668,7 +684,7 @@ void back_of_block(const Frame &frame, int by, int bx, Window &w, const float *f
   for (int y = 0; y < std::min(BLOCK, frame.height - y0); y++)
     for (int x = 0; x < std::min(BLOCK, frame.width - x0); x++)
       if (!has_edges || !(w.edge[(y + RIM) * PITCH + x + RIM] > 0)) {  // a pixel of one surface stays as it is
-        const size_t at = (size_t)(y0 + y) * frame.width + x0 + x;
+        const size_t at = frame.pixel(y0 + y, x0 + x);
         for (int c = 0; c < C; c++) d_maps[0][c * frame.area() + at] += slopes.surfaces[(c * BLOCK + y) * PITCH + x];
         d_maps[1][at] += slopes.surfaces[(2 * C * BLOCK + y) * PITCH + x];
       }
@@ -708,7 +724,7 @@ void back_of_block(const Frame &frame, int by, int bx, Window &w, const float *f
       for (int j = 0; j < size; j++) {
         const int y = std::clamp(y0 - margin + i, 0, frame.height - 1),
                   x = std::clamp(x0 - margin + j, 0, frame.width - 1);
-        to[(size_t)y * frame.width + x] += window[i * PITCH + j];
+        to[frame.pixel(y, x)] += window[i * PITCH + j];
       }
   };
   for (int c = 0; c < C; c++) add_window(&slopes.light[c * plane], EDGES, RIM, d_maps[0] + c * frame.area());
@@ -723,7 +739,7 @@ void cover_block(Job &job, int by, int bx) {
                      *const certainty = weight + area;
   for (int y = by * BLOCK; y < std::min(s.height, (by + 1) * BLOCK); y++)
     for (int x = bx * BLOCK; x < std::min(s.width, (bx + 1) * BLOCK); x++) {
-      const size_t at = (size_t)y * s.width + x;
+      const size_t at = s.pixel(y, x);
       if (!(certainty[at] > 0)) continue;
       const Block block = s.make_block(by * s.block_columns + bx);
       const int within = place_in_block(y, x);
@@ -813,7 +829,7 @@ void Job::add_background() {
   parallel(height, [&](int y, int) {
     std::vector<const float *> own(channels), other(channels);
     for (int x = 0; x < width; x++) {
-      const size_t at = (size_t)y * width + x;
+      const size_t at = surfaces.pixel(y, x);
       const float *own_coc, *own_weight, *other_coc, *weight;
       surfaces.row(0, y, x, own.data(), own_coc, own_weight);
       const bool mixed = surfaces.row(1, y, x, other.data(), other_coc, weight);
@@ -873,7 +889,7 @@ static void matte(const float *const *maps, int channels, int height, int width,
         each_mixed(frame, y0, x0, w, [&](int y, int x, ivec beside) {
           for (int lane = 0; lane < LANES; lane++)
             for (int k = 0; beside[lane] && k < 2 * C + 2; k++)
-              out[k * area + (size_t)(y0 + y) * width + x0 + x + lane] = plane(k)[y * BLOCK + x + lane];
+              out[k * area + frame.pixel(y0 + y, x0 + x + lane)] = plane(k)[y * BLOCK + x + lane];
         });
       }
     });

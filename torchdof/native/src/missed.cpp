@@ -77,8 +77,7 @@ class Missed {
     const int first = tile % across_ * CELLS, count = std::min(CELLS, columns_ - first);
     for (int plane = 0; plane < channels_ + 5; plane++)
       for (int k = 0; k < count; k++)
-        std::fill_n(&background.values[plane * TILE + k * CELL], CELL,
-                    means[plane * cells_ + (size_t)y * columns_ + first + k]);
+        std::fill_n(&background.values[plane * TILE + k * CELL], CELL, means[plane * cells_ + cell(y, first + k)]);
   }
 
   template <typename Body>
@@ -95,7 +94,7 @@ class Missed {
       bool found = false;
       for (int y = from; y < std::min(from + CELL, y1); y += step)
         for (int j = 0; j < TILE; j += LANES) {
-          const size_t at = (size_t)y * pitch_ + tile % across_ * TILE + j;
+          const size_t at = padded(y, tile % across_ * TILE + j);
           if (!any_positive(load<vec>(&ring_[at]))) continue;
           if (!found) prepare(from / CELL);
           found = true;
@@ -121,8 +120,8 @@ class Missed {
     std::fill_n(coc, WINDOW, FAR_PX);
     const int from_x = std::max(x0 - MARGIN, 0), to_x = std::min(x0 + TILE + MARGIN, width_);
     for (int y = std::max(y0 - MARGIN, 0); y < std::min(y0 + TILE + MARGIN, height_); y++)
-      memcpy(coc + (y - y0 + MARGIN) * PITCH + LANES + from_x - x0 + MARGIN,
-             map_.nearness + (size_t)y * width_ + from_x, (to_x - from_x) * sizeof(float));
+      memcpy(coc + (y - y0 + MARGIN) * PITCH + LANES + from_x - x0 + MARGIN, map_.nearness + pixel(y, from_x),
+             (to_x - from_x) * sizeof(float));
     vec low = broadcast(FAR_PX), high = -low;
     for (int at = 0; at < WINDOW; at += LANES) {
       const vec value = load<vec>(coc + at);
@@ -130,7 +129,7 @@ class Missed {
       store(coc + at, valid ? value : broadcast(FAR_PX));
       low = min(low, load<vec>(coc + at)), high = max(high, valid ? value : broadcast(-FAR_PX));
     }
-    for (int i = 0; i < rows; i++) std::fill_n(&ring_[(size_t)(y0 + i) * pitch_ + x0], TILE, 0.0f);
+    for (int i = 0; i < rows; i++) std::fill_n(&ring_[padded(y0 + i, x0)], TILE, 0.0f);
     if (!(reduce_max(high) - reduce_min(low) > APART_PX)) return false;
     std::fill_n(near, WINDOW, FAR_PX);
     std::fill_n(ring, WINDOW, 0.0f);
@@ -157,7 +156,7 @@ class Missed {
     }
     for (int i = 0; found && i < rows; i++) {
       const int at = (MARGIN + i) * PITCH + LANES + MARGIN;
-      const size_t to = (size_t)(y0 + i) * pitch_ + x0;
+      const size_t to = padded(y0 + i, x0);
       memcpy(&ring_[to], ring + at, TILE * sizeof(float));
       memcpy(&near_[to], near + at, TILE * sizeof(float));
     }
@@ -168,7 +167,7 @@ class Missed {
   void read(int tile, int of_cells, int step) const {
     const int x0 = tile % across_ * TILE, count = std::min(TILE, width_ - x0);
     for (int y = of_cells * CELL; y < std::min((of_cells + 1) * CELL, height_); y += step) {
-      const size_t from = (size_t)y * width_ + x0, to = (size_t)y * pitch_ + x0;
+      const size_t from = pixel(y, x0), to = padded(y, x0);
       for (int j = 0; j < count; j++) coc_[to + j] = ring_[to + j] > 0 ? map_.nearness[from + j] : 0.0f;
       std::fill(&coc_[to] + count, &coc_[to] + TILE, 0.0f);
       for (int c = 0; c < channels_; c++) {
@@ -193,10 +192,10 @@ class Missed {
       std::vector<float> sums(cells_), row(columns_ + 2 * reach);
       for (int y = 0; y < rows_; y++)
         for (int v = std::max(y - reach, 0); v <= std::min(y + reach, rows_ - 1); v++)
-          for (int x = 0; x < columns_; x++) sums[(size_t)y * columns_ + x] += plane[(size_t)v * columns_ + x];
+          for (int x = 0; x < columns_; x++) sums[cell(y, x)] += plane[cell(v, x)];
       for (int y = 0; y < rows_; y++) {
-        memcpy(&row[reach], &sums[(size_t)y * columns_], columns_ * sizeof(float));
-        float *const to = plane + (size_t)y * columns_;
+        memcpy(&row[reach], &sums[cell(y, 0)], columns_ * sizeof(float));
+        float *const to = plane + cell(y, 0);
         std::fill_n(to, columns_, 0.0f);
         for (int u = 0; u < side; u++)
           for (int x = 0; x < columns_; x++) to[x] += row[x + u];
@@ -212,7 +211,7 @@ class Missed {
     average(planes, NEARBY);
     planes.resize(planes.size() + cells_);
     parallel(map_.threads, rows_, map_.cancelled, [&](int y, int) {
-      float *const seen = &planes[(size_t)y * columns_], *const light = seen + cells_;
+      float *const seen = &planes[cell(y, 0)], *const light = seen + cells_;
       float *const square = light + channels_ * cells_, *const coc = square + cells_, *const coc_square = coc + cells_;
       float *const is_smooth = coc_square + cells_;
       const float per_channel = 1.0f / (float)channels_;
@@ -256,7 +255,7 @@ class Missed {
         const float *const pixels = planes + k * CELL;
         float sum = 0;
         for (int j = 0; j < CELL; j++) sum += pixels[j];
-        sums[plane * cells_ + (size_t)y * columns_ + tile % across_ * CELLS + k] = sum;
+        sums[plane * cells_ + cell(y, tile % across_ * CELLS + k)] = sum;
       }
   }
 
@@ -371,7 +370,7 @@ class Missed {
     std::vector<std::pair<int, int>> pixels;
     for (int y = 0; y < height_; y++)
       for (int x = 0; x < width_; x++)
-        if (ring_[(size_t)y * pitch_ + x] > 0) pixels.push_back({y, x});
+        if (ring_[padded(y, x)] > 0) pixels.push_back({y, x});
     return pixels;
   }
 
@@ -384,24 +383,24 @@ class Missed {
     for (int grown = 0; grown < GROWTH_PX && !wanted.empty(); grown += GROWTH_STEP_PX) {
       taken.clear();
       for (const auto &[y, x] : wanted) {
-        float &may = ring_[(size_t)y * pitch_ + x];
+        float &may = ring_[padded(y, x)];
         may = std::fabs(may);
         if (!(may > (float)grown)) continue;
         float nearest = FAR_PX;
         each_beside(y, x, [&](int v, int u) {
-          const float coc = map_.out[(size_t)v * width_ + u];
+          const float coc = map_.out[pixel(v, u)];
           if (is_valid(coc)) nearest = std::min(nearest, coc);
         });
-        if (!(-nearest > hiding_px(std::fabs(map_.out[(size_t)y * width_ + x])))) continue;
+        if (!(-nearest > hiding_px(std::fabs(map_.out[pixel(y, x)])))) continue;
         may = 0;
-        near_[(size_t)y * pitch_ + x] = nearest;
+        near_[padded(y, x)] = nearest;
         taken.push_back({y, x});
       }
       wanted.clear();
-      for (const auto &[y, x] : taken) map_.out[(size_t)y * width_ + x] = near_[(size_t)y * pitch_ + x];
+      for (const auto &[y, x] : taken) map_.out[pixel(y, x)] = near_[padded(y, x)];
       for (const auto &[y, x] : taken)
         each_beside(y, x, [&](int v, int u) {
-          float &may = ring_[(size_t)v * pitch_ + u];
+          float &may = ring_[padded(v, u)];
           if (!(may > 0)) return;
           may = -may;  // is listed
           wanted.push_back({v, u});
@@ -410,6 +409,11 @@ class Missed {
     }
     return changed;
   }
+
+  // Index of a pixel in a plane, and in one whose rows are padded to whole tiles; index of a cell.
+  size_t pixel(int y, int x) const { return (size_t)y * width_ + x; }
+  size_t padded(int y, int x) const { return (size_t)y * pitch_ + x; }
+  size_t cell(int y, int x) const { return (size_t)y * columns_ + x; }
 
   template <typename Visit>
   void each_beside(int y, int x, const Visit &visit) const {

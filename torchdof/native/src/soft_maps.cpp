@@ -56,7 +56,7 @@ class SoftMap : EdgeMap {
       }
       for (int y = part.y0; y < part.bottom(); y++)
         for (int x = part.x0; x < part.right(); x++) {
-          const size_t i = (size_t)y * width_ + x;
+          const size_t i = pixel(y, x);
           const float own = sign_ * map_.out[i], gap = *span.at(y, x), ends[2] = {-*up.at(y, x), *down.at(y, x)};
           if (!(std::fabs(own) <= LARGEST && gap > step(i))) continue;
           const float moved = std::clamp(own, std::min(ends[0], ends[1]), std::max(ends[0], ends[1])) - own;
@@ -209,7 +209,7 @@ class SoftMap : EdgeMap {
     max_filter<2>(bright, peak, rows, part);
     for (int y = part.y0; y < part.bottom(); y++)
       for (int x = part.x0; x < part.right(); x++) {
-        const size_t i = (size_t)y * width_ + x;
+        const size_t i = pixel(y, x);
         const float own = *bright.at(y, x);
         if (own > LAMP * *usual.at(y, x) && own > LAMP_PEAK * *peak.at(y, x) &&
             *high.at(y, x) + *low.at(y, x) > LAMP_STEP * step(i) && std::fabs(map_.nearness[i]) <= LARGEST)

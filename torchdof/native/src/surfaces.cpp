@@ -21,7 +21,7 @@ Block Surfaces::make_block(int i) {
   const int y0 = i / block_columns * BLOCK, x0 = i % block_columns * BLOCK;
   const int rows = std::min(BLOCK, height - y0), columns = std::min(BLOCK, width - x0);
   for (int y = 0; y < rows; y++) {
-    const size_t from = (size_t)(y0 + y) * width + x0;
+    const size_t from = pixel(y0 + y, x0);
     for (int c = 0; c < channels; c++)
       memcpy(made.own + c * BLOCK_PIXELS + y * BLOCK, light + c * area() + from, columns * sizeof(float));
     memcpy(made.coc + y * BLOCK, coc + from, columns * sizeof(float));

@@ -30,6 +30,7 @@ class Surfaces {
 
   bool full_planes() const { return !lights.empty(); }
   size_t area() const { return (size_t)height * width; }
+  size_t pixel(int y, int x) const { return (size_t)y * width + x; }  // its index in a plane
   int block_of(int y, int x) const { return y / BLOCK * block_columns + x / BLOCK; }
   bool has_block(int i) const { return blocks[i]; }
   Block block(int i) const {
@@ -44,7 +45,7 @@ class Surfaces {
   // Surface i at n pixels of a row from column x, within one block column: pointers to each channel, coc and weight
   // (null means 1). Returns false if there is no such surface.
   bool row(int i, int y, int x, const float **light_of, const float *&coc_of, const float *&weight_of) const {
-    const size_t at = (size_t)y * width + x;
+    const size_t at = pixel(y, x);
     if (full_planes()) {
       for (int c = 0; c < channels; c++) light_of[c] = lights[i] + c * area() + at;
       coc_of = cocs[i] + at;

@@ -363,7 +363,7 @@ def kernels_of(table: BlurTable, spots: Spots, dtype: torch.dtype = torch.float6
     bank = bank_of(table)
     is_plain = dtype == torch.float32 and spots.moves is None
     if is_plain and engine_reads(torch.empty(0, dtype=dtype, device="cpu")):  # not so in torch.func and fake modes
-        return native.kernels(spots, squeeze=bank.squeeze, is_round=table.is_round, is_even=bank.is_even)
+        return native.kernels(*spots[:-1], squeeze=bank.squeeze, is_round=table.is_round, is_even=bank.is_even)
     made = bank.of_spots(spots)
     spare = [made.shape[-1] // 2 - half for half in spots.half]
     return [k[:, n : k.shape[-1] - n, n : k.shape[-1] - n] for k, n in zip(made, spare, strict=True)]
