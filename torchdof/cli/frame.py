@@ -21,8 +21,9 @@ from ..depth.sentinels import without_sentinels
 from ..io.colour import stated_primaries
 from ..io.estimates import Estimate, estimate_of
 from ..io.highlights import expand_highlights
-from ..io.images import Picture, can_state_transfer, keeps_profile, read_image, read_map, write_image
+from ..io.images import Picture, read_image, read_map, write_image
 from ..io.matte import matte_of_size, read_matte
+from ..io.picture import can_state_transfer, keeps_profile
 from ..io.sheet import shrunk, write_sheet
 from ..module import blur_by_coc
 from ..optics.aperture import Aperture

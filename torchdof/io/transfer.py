@@ -125,3 +125,9 @@ def _linear_to_srgb(linear: Tensor) -> Tensor:
     magnitude = linear.abs()
     curved = 1.055 * magnitude.clamp_min(0.0031308) ** (1 / 2.4) - 0.055  # clamped: the gradient is infinite at 0
     return torch.where(magnitude <= 0.0031308, magnitude * 12.92, curved).copysign(linear)
+
+
+def strips(height: int, numbers_per_row: int) -> list[slice]:
+    """Slices of rows with about a million numbers each, which keep temporary arrays small."""
+    rows = 1 + 2**20 // numbers_per_row
+    return [slice(top, top + rows) for top in range(0, height, rows)]
