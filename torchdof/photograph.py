@@ -72,9 +72,9 @@ def photo(
         >>> round(float(result.coc_px.abs().max()), 1), len(result.notes) > 0
         (3.2, True)
     """
-    from .cli.frame import Renderer  # these import Click and Kornia
     from .cli.output import Notices
     from .cli.render import Render
+    from .cli.renderer import Renderer  # these import Click and Kornia
 
     names = {field.name for field in dataclasses.fields(Render)} - _OF_FILES
     if unknown := sorted(set(options) - names):

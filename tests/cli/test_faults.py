@@ -18,7 +18,7 @@ import pytest
 import torch
 
 from tests.files import as_an_ordinary_user
-from torchdof.cli import frame, output
+from torchdof.cli import output, renderer
 from torchdof.io.images import Picture, read_image, write_image
 
 pytestmark = pytest.mark.hard
@@ -123,14 +123,14 @@ def test_the_next_frame_is_read_and_the_last_written_while_one_is_rendered(
 ) -> None:
     barrier = threading.Barrier(3)  # passes only if all three steps run at the same time
 
-    def waiting(self: frame.Renderer, step: Callable[..., Any], out: str, *arguments: Any, **named: Any) -> Any:
+    def waiting(self: renderer.Renderer, step: Callable[..., Any], out: str, *arguments: Any, **named: Any) -> Any:
         if out in repr(arguments):
             barrier.wait(20)
         return step(self, *arguments, **named)
 
     for name, out in (("read", "shot.0003"), ("render", "out.0002"), ("write", "out.0001")):
-        original = getattr(frame.Renderer, name)
-        monkeypatch.setattr(frame.Renderer, name, functools.partialmethod(waiting, original, out))
+        original = getattr(renderer.Renderer, name)
+        monkeypatch.setattr(renderer.Renderer, name, functools.partialmethod(waiting, original, out))
     assert [line[:12] for line in run(SEQUENCE).splitlines()] == [f"out.000{n}.exr" for n in (1, 2, 3)]
 
 
@@ -144,7 +144,7 @@ def test_a_huge_range_of_frames_is_refused_at_once(scene: Path, run: Callable[..
 
 LIMITED = """
 import resource, sys
-import torch, torchdof.cli.main, torchdof.cli.frame, OpenImageIO
+import torch, torchdof.cli.main, torchdof.cli.renderer, OpenImageIO
 torch.set_num_threads(1)
 pages = int(open("/proc/self/statm").read().split()[0])
 limit = pages * resource.getpagesize() + (96 << 20)

@@ -17,10 +17,11 @@ from torch import Tensor
 
 import torchdof
 from tests.files import store
-from torchdof.cli.frame import Renderer, coc_of, read_frame
+from torchdof.cli.frame import coc_of, read_frame
 from torchdof.cli.main import app
 from torchdof.cli.options import Scene
 from torchdof.cli.output import Notices, rounded
+from torchdof.cli.renderer import Renderer
 from torchdof.io.highlights import expand_highlights
 from torchdof.io.images import Picture, read_image, read_values, write_image
 from torchdof.optics.field import Field
@@ -116,7 +117,7 @@ def test_render_equals_the_function_on_tensors(
         passed.update(others)
         return torchdof.blur_by_coc(*tensors, **others)
 
-    monkeypatch.setattr("torchdof.cli.frame.blur_by_coc", record)
+    monkeypatch.setattr("torchdof.cli.renderer.blur_by_coc", record)
     line = run(f"render image.exr depth.npy -o out.exr --device cpu {options}")
     expected = torchdof.depth_of_field(image, depth, camera, **arguments)
     torch.testing.assert_close(pixels("out.exr"), expected, rtol=0, atol=1e-6)

@@ -8,13 +8,11 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-import click
-
 from ..io.atomic import check_writable
 from ..io.paths import IMAGE_SUFFIXES, MAP_SUFFIXES, OPTIONAL_SUFFIXES
 from .command import refuse
 from .options import check_files
-from .output import Notices, json_line, progress_bar, to_stderr
+from .output import Notices, list_done, progress_bar, to_stderr
 from .resume import Record
 
 if TYPE_CHECKING:
@@ -99,11 +97,7 @@ def render_folder(command: "Render", options: dict[str, object]) -> None:
         done = record.kept(
             existing, {n: [p.image, p.depth, p.matte, *command.files()] for n, p in enumerate(pictures)}, False
         )
-    if done:
-        lines = [json_line({"out": str(path), "is_there_already": True}) for path in sorted(done)]
-        click.echo(
-            "\n".join(lines) if command.as_json else f"{len(done)} of {len(pictures)} pictures are there already"
-        )
+    list_done(done, f"{len(done)} of {len(pictures)} pictures are", command.as_json)
     todo = [picture for picture in pictures if picture.out not in done]
     failed = dict(_render_each(command, todo, record)) if todo else {}
     if failed:
@@ -113,7 +107,7 @@ def render_folder(command: "Render", options: dict[str, object]) -> None:
 
 def _render_each(command: "Render", todo: Sequence[Picture], record: Record) -> Iterator[tuple[Path, str]]:
     """Renders pictures in order; while one is rendered, the next is read. Gives each that failed, and why."""
-    from .frame import Renderer
+    from .renderer import Renderer
 
     one_by_one = dataclasses.replace(command, matte=None) if command.has_matte_file else command
     renderer = Renderer(one_by_one, is_still=True)

@@ -5,7 +5,8 @@ import json
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -25,6 +26,13 @@ def json_line(facts: Mapping[str, Any]) -> str:
     """Facts as one line of JSON; numbers that are not finite become the strings inf, -inf and nan."""
     text = json.dumps(facts, default=lambda value: value.tolist())  # numpy's numbers and arrays
     return json.dumps(json.loads(text, parse_constant=_NOT_FINITE.__getitem__))
+
+
+def list_done(files: Collection[Path], text: str, as_json: bool) -> None:
+    """Prints which files are there already, one in each line of JSON, or how many: ``text`` begins the line."""
+    if files:
+        lines = [json_line({"out": str(path), "is_there_already": True}) for path in sorted(files)]
+        click.echo("\n".join(lines) if as_json else f"{text} there already")
 
 
 def rounded(text: str) -> str:

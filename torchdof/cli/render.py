@@ -11,20 +11,21 @@ from typing import TYPE_CHECKING, Literal
 import click
 
 from ..io.atomic import check_writable, remove_unfinished
-from ..io.sequence import FramePattern, parse_frames
+from ..io.sequence import parse_frames
 from .command import Command, Group, Parsed, argument, numbers, option, refuse
-from .options import Accuracy, Blur, Scene, check_files
-from .output import json_line, progress_bar, to_stderr
+from .frames import Frames
+from .options import Accuracy, Blur, Scene
+from .output import list_done, progress_bar, to_stderr
 from .resume import Record
 
 if TYPE_CHECKING:
-    from .frame import Frame, Renderer
+    from .frame import Frame
+    from .renderer import Renderer
 
 _OWN_EXTREMES = (
     "each frame's relative depth is scaled by its own extremes, so that distances pulse; give the values that near and "
     "far have in all frames: --value-range LOW,HIGH"
 )
-_MOST_FRAMES = 1_000_000  # of one run; a larger number is a slip of the finger, and would not fit into memory
 Encoding = Literal["linear", "srgb"]
 _NOT_OF_FRAMES = ("out", "sheet", "frames", "resume", "strict", "device", "as_json")  # options that change no frame
 
@@ -126,101 +127,76 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
             from .folder import render_folder
 
             return render_folder(self, options)
-        images, depths, numbered, mattes = map(FramePattern.of, (self.image, self.depth, self.out, self.matte))
-        keys = (self.focus_m or []) if images is None else []
-        is_single = images is None and len(keys) < 2
-        has_number = numbered and FramePattern.is_padded(self.out) and not FramePattern.is_padded(self.image)
-        of_sequences = (images is None and (self.steady or depths)) or (is_single and (self.frames or has_number))
-        no_number = f"{self.out}: expected one place for the frame number, such as pull.##.png; ffmpeg joins frames"
-        are_exr = {self.image.suffix.lower(), self.out.suffix.lower()} == {".exr"}
-        refuse(
-            (self.keep_layers and not are_exr, "--keep-layers is for an EXR that is written to an EXR; leave it out"),
-            (not is_single and not numbered, no_number),
-            (self.sheet and not is_single, "--sheet is of one picture; leave it out where there are more"),
-            (mattes and not images, f"{self.matte}: masks of frames are for a sequence; IMAGE is a single image"),
-            (of_sequences, f"{self.image}: is a single image; for a sequence write it as shot.####.exr"),
-            (images and self.blur, "--blur would open the lens anew in each frame of a sequence; give --f-number"),
-            (self.steady and self.depth_kind == "coc", "--steady filters depth in metres; --depth-kind coc has none"),
-        )
-
-        def sources(n: int) -> tuple[Path, Path | None]:
-            return images.name(n) if images else self.image, depths.name(n) if depths else self.depth
-
-        def matte(n: int) -> Path | None:
-            return mattes.name(n) if mattes else None
-
-        numbers: Sequence[int] = [0]
-        if images and not self.frames:
-            numbers = images.frames()
-        elif not is_single:
-            first, last = self.frames or (keys[0][0], keys[-1][0])
-            numbers = range(first, last + 1)
-            for pattern in filter(None, (images, depths, mattes)):
-                pattern.refuse_missing(numbers)
-            refuse((len(numbers) > _MOST_FRAMES, f"{first}-{last} are {len(numbers)} frames, more than {_MOST_FRAMES}"))
-        if not numbers:
-            raise FileNotFoundError(f"{self.image}: there are no such files")
-        outputs: dict[int, Path] = {}
-        for n in numbers:
-            outputs[n] = numbered.name(n) if numbered and not is_single else self.out
-            check_files(*sources(n), outputs[n], self.sheet, matte=matte(n))
-        whole = list(numbers)  # frames of the sequence, each of which may depend on those before it
-        if images and self.steady:
-            whole = [n for n in images.frames() if depths is None or depths.name(n).is_file()]
-        record, existing = Record(self.out, options), [out for out in outputs.values() if out.is_file()]
-        reason, done = record.difference(), set[Path]()
-        if self.resume:
-            removed, young = remove_unfinished(self.out.parent)
-            if removed:
-                to_stderr(f"note: {self.out.parent}: removed {removed} unfinished files (.part) of killed runs")
-            if young:
-                writer = "another run is writing, or was killed a moment ago"
-                to_stderr(f"note: {self.out.parent}: {young} unfinished files (.part) stay, which {writer}")
-        if self.resume and not reason:
-            done = record.kept(outputs, {n: [*sources(n), matte(n), *self.files()] for n in whole}, self.steady)
-            reason = "they are older than their files or options, or they are cut short"
-        if done:
-            share = f"{self.out}: is" if is_single else f"{len(done)} of {len(outputs)} frames are"
-            lines = [json_line({"out": str(out), "is_there_already": True}) for out in sorted(done)]
-            click.echo("\n".join(lines) if self.as_json else f"{share} there already")
-        todo = {n: out for n, out in outputs.items() if out not in done}
+        frames, record = Frames.of(self), Record(self.out, options)
+        files = frames.files()
+        done, reason = self._done(frames, files, record)
+        todo = {n: out for n, out in files.items() if out not in done}
         if not todo:
             return
         for out in filter(None, [*todo.values(), self.sheet]):
             check_writable(out)
-        from ..depth.sanity import Mistake
-        from ..depth.steady import SteadyFrames
-        from .frame import Renderer
+        renderer = self._renderer(frames)
+        again = len([out for out in files.values() if out.is_file()]) - len(done)
+        if self.resume and again:
+            renderer.notices.note("again", f"{self.out}: {again} of {len(files)} frames are rendered again: {reason}")
+        if frames.images and self.depth_kind == "relative" and self.value_range is None and len(files) > 1:
+            from ..depth.sanity import Mistake
 
-        is_auto = images is not None and self.depth_kind == "auto"  # a guess could differ from frame to frame
-        of_frames = dataclasses.replace(self, depth_kind="z") if is_auto else self
-        is_stated = context.get_parameter_source("depth_kind") is not click.core.ParameterSource.DEFAULT
-        is_implied = self.strict and self.depth_kind == "z" and self.depth_scale is None and not is_stated
-        is_assumed = is_auto or (images is not None and is_implied)
-        renderer = Renderer(of_frames, images is None, is_assumed)
-        renderer.has_table = is_single
-        if self.resume and len(existing) > len(done):
-            again = f"{len(existing) - len(done)} of {len(outputs)} frames are rendered again"
-            renderer.notices.note("again", f"{self.out}: {again}: {reason}")
-        if images and self.depth_kind == "relative" and self.value_range is None and len(numbers) > 1:
             renderer.notices.warn(self.depth or self.image, [Mistake("range", _OWN_EXTREMES)])
-        read_files = functools.lru_cache(maxsize=1)(renderer.read)  # a focus pull reads one image many times
-        in_one_file = images and not depths and self.depth and self.depth.suffix.lower() in (".npy", ".npz")
-        all_frames = images.frames() if images and in_one_file else []
-        places = {n: (k, len(all_frames)) for k, n in enumerate(all_frames)}
+        is_recorded = self.resume or not frames.is_single or record.path.is_file()
+        self._render_each(renderer, todo, self._reader(renderer, frames, [*files]), record if is_recorded else None)
 
-        def as_stored(n: int) -> "Frame":
-            return read_files(*sources(n), places.get(n), matte(n))
+    def _done(self, frames: Frames, files: Mapping[int, Path], record: Record) -> tuple[set[Path], str]:
+        """The files that --resume keeps, which are listed, and why others are rendered again."""
+        reason, done = record.difference(), set[Path]()
+        if not self.resume:
+            return done, reason
+        removed, young = remove_unfinished(self.out.parent)
+        if removed:
+            to_stderr(f"note: {self.out.parent}: removed {removed} unfinished files (.part) of killed runs")
+        if young:
+            writer = "another run is writing, or was killed a moment ago"
+            to_stderr(f"note: {self.out.parent}: {young} unfinished files (.part) stay, which {writer}")
+        if reason:
+            return done, reason
+        sources = {n: [*frames.sources(n), frames.matte(n), *self.files()] for n in frames.read_for([*files])}
+        done = record.kept(files, sources, self.steady)
+        share = f"{self.out}: is" if frames.is_single else f"{len(done)} of {len(files)} frames are"
+        list_done(done, share, self.as_json)
+        return done, "they are older than their files or options, or they are cut short"
 
+    def _renderer(self, frames: Frames) -> "Renderer":
+        """Renders the frames; of a sequence, depth is not guessed, as a guess could differ from frame to frame."""
+        from .renderer import Renderer
+
+        source = click.get_current_context().get_parameter_source("depth_kind")
+        is_sequence, is_auto = frames.images is not None, frames.images is not None and self.depth_kind == "auto"
+        is_stated = source is not click.core.ParameterSource.DEFAULT or self.depth_scale is not None
+        is_implied = is_sequence and self.strict and self.depth_kind == "z" and not is_stated
+        of_frames = dataclasses.replace(self, depth_kind="z") if is_auto else self
+        renderer = Renderer(of_frames, not is_sequence, is_auto or is_implied)
+        renderer.has_table = frames.is_single
+        return renderer
+
+    def _reader(self, renderer: "Renderer", frames: Frames, numbers: Sequence[int]) -> "Callable[[int], Frame]":
+        """Reads a frame, with its depth filtered along time if that is wanted."""
+        from ..depth.steady import SteadyFrames
+
+        read_files, places = functools.lru_cache(maxsize=1)(renderer.read), frames.places()
+
+        def as_stored(n: int) -> "Frame":  # a focus pull reads one image many times
+            return read_files(*frames.sources(n), places.get(n), frames.matte(n))
+
+        if not (frames.images and self.steady):
+            return as_stored
+        whole = frames.read_for(numbers)
         steady = SteadyFrames(lambda k: (as_stored(whole[k]).picture.pixels, as_stored(whole[k]).values))
 
         def steadied(n: int) -> "Frame":
             values = steady.depth(whole.index(n))  # reads frame n last, so that it is still in the cache
             return dataclasses.replace(as_stored(n), values=values)
 
-        is_recorded = self.resume or not is_single or record.path.is_file()
-        read = steadied if images and self.steady else as_stored
-        self._render_each(renderer, todo, read, record if is_recorded else None)
+        return steadied
 
     def _render_each(
         self, renderer: "Renderer", files: Mapping[int, Path], read: "Callable[[int], Frame]", record: Record | None
