@@ -47,12 +47,11 @@ extern "C" __global__ void split(const __grid_constant__ Run r) {
   const Split s = split_of(r, p);
   EACH_CHANNEL {
     const Moved m = moved_of(r, p, s, c);
-    const float moved = torchdof::min(m.steps[3], s.weight * m.most);
-    r.surfaces[p.in(r, PLANES, c)] = (m.light - moved) / (1 - s.weight) * s.scale;
-    r.surfaces[p.in(r, PLANES, OTHER + c)] = s.weight > 0 ? moved / torchdof::max(s.weight, LEAST) * s.scale : 0.0f;
+    r.surfaces[p.in(r, PLANES, c)] = s.mixed.own_light(m) * s.scale;
+    r.surfaces[p.in(r, PLANES, OTHER + c)] = s.mixed.other_light(m) * s.scale;
   }
-  r.surfaces[p.in(r, PLANES, COC)] = s.by_owner(s.ends.far, s.ends.near);
-  r.surfaces[p.in(r, PLANES, WEIGHT)] = s.weight;
+  r.surfaces[p.in(r, PLANES, COC)] = s.mixed.by_owner(s.ends.far, s.ends.near);
+  r.surfaces[p.in(r, PLANES, WEIGHT)] = s.mixed.weight;
 }
 
 // The surfaces of a pixel by a matte, from those of `split`: the certainty that they are known, weights of the other surface in the one
@@ -154,99 +153,23 @@ struct Parts {
   }
 };
 
-// The gradients by what a split is computed from.
+// Steps 5 to 3 back: the gradients by the mean colours, and by the pixel's own light, `middle`.
 struct OfSplit {
-  float near, far, coc, gap, weight, edge, covered, variance;
-  float near_light[CHANNELS], far_light[CHANNELS], middle[CHANNELS];  // by the mean colours, and by the pixel's own light
+  torchdof::OfMixedPixel<float> by;
+  float near[CHANNELS], far[CHANNELS], middle[CHANNELS];
 };
-
-// Step 5 back; `of` is zero before.
-__device__ inline void moved_back(const Run &r, const Pixel &p, const Split &s, const Parts &parts, OfSplit &of) {
-  const float own = 1 - s.weight, known = torchdof::max(s.weight, LEAST), squares = s.weight * s.weight + own * own;
-  const float of_coc = r.of_surfaces[p.in(r, PLANES, COC)];
-  float of_own = 0, of_lent = 0;
-  of.near += s.is_near ? 0.0f : of_coc;
-  of.far += s.is_near ? of_coc : 0.0f;
-  of.weight += r.of_surfaces[p.in(r, PLANES, WEIGHT)];
+__device__ inline OfSplit split_back_of(const Run &r, const Pixel &p, const Split &s, const Parts &parts) {
+  OfSplit of = {};
+  of.by.weight = r.of_surfaces[p.in(r, PLANES, WEIGHT)];
   EACH_CHANNEL {
-    const Moved m = moved_of(r, p, s, c);
-    const float moved = torchdof::min(m.steps[3], s.weight * m.most), other_light = moved / known;
-    const float of_left = r.of_surfaces[p.in(r, PLANES, c)] * s.scale / own;
-    const float of_other = s.weight > 0 ? r.of_surfaces[p.in(r, PLANES, OTHER + c)] * s.scale : 0.0f;
-    of.middle[c] += of_left;
-    of_own -= of_left * ((m.light - moved) / own);
-    if (s.weight >= LEAST) of.weight -= of_other * other_light / known;
-    float of_moved = of_other / known - of_left;
-    // each limit takes the gradient where it is in force, and half of it where both values are equal
-    auto taken = [&](bool limits, bool equals) {
-      const float part = limits ? of_moved : equals ? 0.5f * of_moved : 0.0f;
-      of_moved -= part;
-      return part;
-    };
-    const float highest = s.weight * m.most, lowest = s.weight * m.least, own_least = m.light - own * m.least, own_most = m.light - own * m.most;
-    const float by_highest = taken(highest < m.steps[3], highest == m.steps[3]), by_lowest = taken(lowest > m.steps[2], lowest == m.steps[2]);
-    const float by_own_least = taken(own_least < m.steps[1], own_least == m.steps[1]);
-    const float by_own_most = taken(own_most > m.steps[0], own_most == m.steps[0]);
-    of.weight += by_highest * m.most + by_lowest * m.least;
-    of.middle[c] += by_own_least + by_own_most;
-    of_own -= by_own_least * m.least + by_own_most * m.most;
-    const float dark = r.darkest[p.item * CHANNELS + c] / s.scale, bright = r.brightest[p.item * CHANNELS + c] / s.scale;
-    parts.of_end(c) = absolute(dark) <= UNBOUNDED ? (by_lowest * s.weight - by_own_least * own) * s.per_scale : 0.0f;
-    parts.of_end(CHANNELS + c) = absolute(bright) <= UNBOUNDED ? (by_highest * s.weight - by_own_most * own) * s.per_scale : 0.0f;
-    // moved = weight (other_mean + residual each), each = lent weight / squares
-    const float of_each = of_moved * s.weight * m.residual, of_residual = of_moved * s.weight * m.each;
-    of.weight += of_moved * (m.other_mean + m.residual * m.each) - of_residual * m.other_mean;
-    of.weight += of_each * s.lent * (own - s.weight) * (own + s.weight) / (squares * squares);
-    of_own -= of_residual * m.own_mean + of_each * s.lent * 2 * s.weight * own / (squares * squares);
-    of_lent += of_each * s.weight / squares;
-    of.middle[c] += of_residual;
-    const float of_own_mean = -of_residual * own, of_other_mean = of_moved * s.weight - of_residual * s.weight;
-    of.near_light[c] += s.by_owner(of_own_mean, of_other_mean);
-    of.far_light[c] += s.by_owner(of_other_mean, of_own_mean);
+    const float of_own = r.of_surfaces[p.in(r, PLANES, c)] * s.scale, of_other = r.of_surfaces[p.in(r, PLANES, OTHER + c)] * s.scale;
+    const auto ends = s.mixed.back_of_moved(moved_of(r, p, s, c), of_own, of_other, of.by, of.middle[c], of.near[c], of.far[c]);
+    const int end = p.item * CHANNELS + c;
+    parts.of_end(c) = absolute(r.darkest[end] / s.scale) <= UNBOUNDED ? ends.darkest * s.per_scale : 0.0f;
+    parts.of_end(CHANNELS + c) = absolute(r.brightest[end] / s.scale) <= UNBOUNDED ? ends.brightest * s.per_scale : 0.0f;
   }
-  // lent = 1 - sharper, sharper = |coc| - |coc of the other surface|
-  const float of_sharper = within(1 - s.sharper) ? -of_lent : 0.0f;
-  of.coc += of_sharper * sign(s.coc);
-  of.near -= s.is_near ? 0.0f : of_sharper * sign(s.ends.near);
-  of.far -= s.is_near ? of_sharper * sign(s.ends.far) : 0.0f;
-  of.weight -= of_own;
-}
-
-// Steps 4 and 3 back.
-__device__ inline void weight_back(const Run &r, const Pixel &p, const Split &s, OfSplit &of) {
-  const float sum = s.noise + s.contradiction, agreeing = s.noise / sum, of_by_place = of.weight * agreeing;
-  const float of_agreeing = of.weight * s.by_place / sum, of_contradiction = -of_agreeing * agreeing;
-  const float cover = torchdof::min(s.by_cover, 0.5f), fit = torchdof::min(s.by_fit, 0.5f), wide = clamp01(s.wide), doubt = 1 - s.trust;
-  const float of_clear = of_by_place * cover * doubt * wide + of.weight * fit * s.trust;
-  const float of_trust = (of.weight * fit - of_by_place * cover * wide) * s.clear;
-  const float of_cover = s.by_cover <= 0.5f ? of_by_place * s.clear * doubt * wide : 0.0f;
-  const float of_fit = s.by_fit <= 0.5f ? of.weight * s.clear * s.trust : 0.0f;
-  const float off = s.covered - s.fitted, of_off = of_contradiction * 2 * off * s.strength;
-  of.covered += of_off + s.by_owner(-of_cover, of_cover);
-  float of_fitted = s.by_owner(-of_fit, of_fit) - of_off;
-  of.edge += of_clear * clamp01(torchdof::unlimited_sided(s.sided()));
-  const float of_sided = within(torchdof::unlimited_sided(s.sided())) ? PLACE_SLOPE * of_clear * s.edge / s.gap : 0.0f;
-  of.coc += 2 * sign(s.side) * of_sided;
-  of.near -= sign(s.side) * of_sided;
-  of.far -= sign(s.side) * of_sided;
-  of.gap += (within(s.wide) ? of_by_place * cover * s.clear * doubt / EDGE_PX : 0.0f) - of_sided * s.sided();
-  const float of_total = -of_trust * s.trust / s.total, of_misfit = of_contradiction + of_total * TRUST;
-  float of_strength = of_trust / s.total + of_total + of_contradiction * off * off;
-  of.variance += of_total * TRUST + of_agreeing * (1 - agreeing);
-  EACH_CHANNEL {
-    const float left = s.light(r, p, c) - s.seen.far[c] - s.fitted * s.seen.contrast(c);
-    of_fitted -= 2 * of_misfit * left * s.seen.contrast(c);
-  }
-  const float of_along = within(s.along) ? of_fitted / torchdof::max(s.strength, LEAST) : 0.0f;
-  if (s.strength >= LEAST) of_strength -= of_along * s.along;
-  EACH_CHANNEL {
-    const float contrast = s.seen.contrast(c), from_far = s.light(r, p, c) - s.seen.far[c];
-    const float of_left = 2 * of_misfit * (from_far - s.fitted * contrast), of_from_far = of_left + of_along * contrast;
-    const float of_contrast = of_along * from_far + 2 * of_strength * contrast - of_left * s.fitted;
-    of.middle[c] += of_from_far;
-    of.near_light[c] += of_contrast;
-    of.far_light[c] -= of_from_far + of_contrast;
-  }
+  s.mixed.back_of_weight(s.own_light, s.seen.near, s.seen.far, r.of_surfaces[p.in(r, PLANES, COC)], of.by, of.middle, of.near, of.far);
+  return of;
 }
 
 // The parts of the gradients by light, coc, certainty and clean light around. Elsewhere than at edges the surfaces are the values.
@@ -260,20 +183,18 @@ extern "C" __global__ void __launch_bounds__(TILE_ROWS * TILE_COLUMNS) split_bac
   }
   const Split s = split_of(r, p);
   const Parts parts(r, p);
-  OfSplit of = {};
-  moved_back(r, p, s, parts, of);
-  weight_back(r, p, s, of);
+  OfSplit of = split_back_of(r, p, s, parts);
 
   // Step 2 back. seen = light - limited contrast, share = per_strength sum((light - clean) contrast), of the clean colours
   float of_contrast[CHANNELS] = {}, of_strength = 0;
   TAP_BY_TAP for (int i = 0; i < TAPS; i++) {
     const Neighbour n = s.neighbour(r, p, i);
     const Light l = s.light(r, n);
-    float of_nearer = -of.variance * s.seen.near_variance / s.total_nearer, of_share = 0;
-    float of_farther = -of.variance * s.seen.far_variance / s.total_farther;
+    float of_nearer = -of.by.variance * s.seen.near_variance / s.total_nearer, of_share = 0;
+    float of_farther = -of.by.variance * s.seen.far_variance / s.total_farther;
     EACH_CHANNEL {
       const float seen = l.value[c] - l.limited * s.clean.contrast(c);
-      const float of_seen = s.colours_back(s.seen, c, n, seen, of.near_light[c], of.far_light[c], of.variance, of_nearer, of_farther);
+      const float of_seen = s.colours_back(s.seen, c, n, seen, of.near[c], of.far[c], of.by.variance, of_nearer, of_farther);
       of_share -= of_seen * s.clean.contrast(c);
       of_contrast[c] -= of_seen * l.limited;
       parts.at(c, i) = of_seen;
@@ -302,13 +223,13 @@ extern "C" __global__ void __launch_bounds__(TILE_ROWS * TILE_COLUMNS) split_bac
     }
     const float near = torchdof::unlimited_on_near(n.nearness), far = torchdof::unlimited_on_far(n.nearness), valid = counts(r, n.pixel);
     const float of_sides = (within(near) ? of_nearer : 0.0f) - (within(far) ? of_farther : 0.0f);
-    const float of_nearness = (PLACE_SLOPE * n.unmixed * of_sides + of.covered * falloff(i, SOFTNESS_FALLOFF) * valid * s.per_counted) / s.gap;
-    of.far += of_nearness;
-    of.gap -= of_nearness * n.nearness;
-    parts.at(OF_EDGE, i) = (i == MIDDLE ? of.edge : 0.0f) - falloff(i, FALLOFF) * valid * (of_nearer * clamp01(near) + of_farther * clamp01(far));
-    parts.at(OF_COC, i) = (i == MIDDLE ? of.coc : 0.0f) - of_nearness;
+    const float of_nearness = (PLACE_SLOPE * n.unmixed * of_sides + of.by.covered * falloff(i, SOFTNESS_FALLOFF) * valid * s.per_counted) / s.gap;
+    of.by.far_px += of_nearness;
+    of.by.gap -= of_nearness * n.nearness;
+    parts.at(OF_EDGE, i) = (i == MIDDLE ? of.by.edge : 0.0f) - falloff(i, FALLOFF) * valid * (of_nearer * clamp01(near) + of_farther * clamp01(far));
+    parts.at(OF_COC, i) = (i == MIDDLE ? of.by.coc : 0.0f) - of_nearness;
   }
-  parts.add_ends(r, p, s.ends, of.near - of.gap, of.far + of.gap);
+  parts.add_ends(r, p, s.ends, of.by.near_px - of.by.gap, of.by.far_px + of.by.gap);
 }
 
 // Adds the parts of the gradients by `planes` values of a pixel. A pixel of the border is around others, and itself, several times.

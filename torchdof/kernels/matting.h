@@ -1,14 +1,15 @@
 // What the kernels of matting.cu work on: maps, pixels, and the small rules of edges and of clean light.
 #pragma once
 #include "constants/matting.h"
-#include "rules.h"
+#include "mixed_pixel.h"
 
+using torchdof::absolute;
 using torchdof::clamp01;
+using torchdof::LEAST;
+using torchdof::sign;
 using torchdof::TINY;
 using torchdof::within;
 using namespace torchdof::constants::matting;
-
-constexpr float LEAST = 1e-12f;  // smallest divisor
 
 constexpr int TILE_ROWS = 4, TILE_COLUMNS = 32;  // a block of threads, as in matting.py
 constexpr int TAPS = 9, MIDDLE = TAPS / 2;       // pixels around one, row by row
@@ -66,8 +67,6 @@ struct Pixel {
   }
 };
 
-__device__ inline float absolute(float v) { return torchdof::max(v, -v); }
-__device__ inline float sign(float v) { return v > 0 ? 1.0f : v < 0 ? -1.0f : 0.0f; }
 __device__ inline float falloff(int i, float beside) { return i == MIDDLE ? 1.0f : i % 2 ? beside : beside * beside; }
 __device__ inline float coc_of(const Run &r, const Pixel &p) { return r.coc[p.in(r, 1, 0)]; }
 __device__ inline float edge_of(const Run &r, const Pixel &p) { return r.edge[p.in(r, 1, 0)]; }

@@ -22,17 +22,14 @@ struct Light {
 // The split of a pixel at an edge. Light is relative to the brightest light around, `scale`.
 struct Split {
   Ends ends;
-  float coc, gap, scale, per_scale;
-  bool is_near;                       // whether the pixel's own surface is the near one
+  float gap, scale, per_scale;
   float total_nearer, total_farther;  // sums of the weights
   Colours clean, seen;                // of the clean light, and of the light without that of the other surface
   float per_strength;                 // of the contrast of the clean colours
-  float covered, per_counted;         // by the near surface, under the small Gaussian; and its norm
-  float strength, along, fitted, misfit, noise, total, trust, edge, side, clear, contradiction, by_fit, by_cover, wide, by_place, weight;
-  float sharper, lent;
+  float per_counted;  // of the small Gaussian under which the near surface covers the pixel
+  torchdof::MixedPixel<float, CHANNELS> mixed;
+  float own_light[CHANNELS];
 
-  __device__ float by_owner(float if_near, float if_far) const { return is_near ? if_near : if_far; }
-  __device__ float sided() const { return absolute(side) / gap; }
   __device__ float light(const Run &r, const Pixel &q, int c) const { return light_of(r, q, c) * per_scale; }
   __device__ Neighbour neighbour(const Run &r, const Pixel &p, int i) const {
     Neighbour n = {p.around(r, i), 0, 0, 0, 0};
@@ -96,20 +93,18 @@ __device__ inline Split split_of(const Run &r, const Pixel &p) {
   Split s = {};
   // Step 1: the two surfaces
   s.ends = ends_of(r, p);
-  s.coc = coc_of(r, p);
   s.gap = s.ends.far - s.ends.near;
-  s.is_near = s.coc - s.ends.near < s.ends.far - s.coc;
-  s.edge = edge_of(r, p);
 
   // Step 2: their colours
   s.scale = TINY;
-  s.total_nearer = s.total_farther = s.covered = s.per_counted = 0;
+  s.total_nearer = s.total_farther = s.per_counted = 0;
+  float covered = 0;
   TAP_BY_TAP for (int i = 0; i < TAPS; i++) {
     const Neighbour n = s.neighbour(r, p, i);
     const float small = falloff(i, SOFTNESS_FALLOFF) * counts(r, n.pixel);
     s.total_nearer += n.nearer;
     s.total_farther += n.farther;
-    s.covered += small * n.nearness;
+    covered += small * n.nearness;
     s.per_counted += small;
     EACH_CHANNEL s.scale = torchdof::max(s.scale, absolute(light_of(r, n.pixel, c)));
   }
@@ -117,59 +112,24 @@ __device__ inline Split split_of(const Run &r, const Pixel &p) {
   s.total_nearer = torchdof::max(s.total_nearer, LEAST);
   s.total_farther = torchdof::max(s.total_farther, LEAST);
   s.per_counted = 1 / torchdof::max(s.per_counted, LEAST);
-  s.covered *= s.per_counted;
   s.clean = s.colours(r, p, [](const Light &l, int c) { return l.clean[c]; });
-  s.strength = TEXTURE * s.clean.variance() + ALIKE * ALIKE;
-  EACH_CHANNEL s.strength += s.clean.contrast(c) * s.clean.contrast(c);
-  s.per_strength = 1 / s.strength;
+  float strength = TEXTURE * s.clean.variance() + ALIKE * ALIKE;
+  EACH_CHANNEL strength += s.clean.contrast(c) * s.clean.contrast(c);
+  s.per_strength = 1 / strength;
   const Colours &clean = s.clean;
   s.seen = s.colours(r, p, [&clean](const Light &l, int c) { return l.value[c] - l.limited * clean.contrast(c); });
 
   // Steps 3 and 4: the part of the pixel that the other surface covers
-  s.along = s.strength = s.misfit = 0;
-  EACH_CHANNEL {
-    s.strength += s.seen.contrast(c) * s.seen.contrast(c);
-    s.along += (s.light(r, p, c) - s.seen.far[c]) * s.seen.contrast(c);
-  }
-  s.along /= torchdof::max(s.strength, LEAST);
-  s.fitted = clamp01(s.along);
-  EACH_CHANNEL {
-    const float left = s.light(r, p, c) - s.seen.far[c] - s.fitted * s.seen.contrast(c);
-    s.misfit += left * left;
-  }
-  s.noise = s.seen.variance() + ALIKE * ALIKE;
-  s.total = s.strength + TRUST * (s.seen.variance() + s.misfit) + ALIKE * ALIKE;
-  s.trust = s.strength / s.total;
-  s.side = (s.coc - s.ends.near) - (s.ends.far - s.coc);
-  s.clear = s.edge * clamp01(torchdof::unlimited_sided(s.sided()));
-  s.by_fit = s.by_owner(1 - s.fitted, s.fitted);
-  s.by_cover = s.by_owner(1 - s.covered, s.covered);
-  s.wide = s.gap / EDGE_PX - 2;
-  s.by_place = torchdof::min(s.by_cover, 0.5f) * s.clear * (1 - s.trust) * clamp01(s.wide);
-  s.contradiction = s.misfit + (s.covered - s.fitted) * (s.covered - s.fitted) * s.strength;
-  s.weight = torchdof::min(s.by_fit, 0.5f) * s.clear * s.trust + s.by_place * s.noise / (s.noise + s.contradiction);
-  s.sharper = absolute(s.coc) - absolute(s.by_owner(s.ends.far, s.ends.near));
-  s.lent = clamp01(1 - s.sharper);
+  s.mixed.coc = coc_of(r, p), s.mixed.near_px = s.ends.near, s.mixed.far_px = s.ends.far, s.mixed.gap = s.gap;
+  s.mixed.edge = edge_of(r, p), s.mixed.covered = covered * s.per_counted, s.mixed.variance = s.seen.variance();
+  EACH_CHANNEL s.own_light[c] = s.light(r, p, c);
+  s.mixed.weigh(s.own_light, s.seen.near, s.seen.far);
   return s;
 }
 
-// Step 5: light of the other surface times its weight, and the steps to it: without limits, then with one after the other.
-struct Moved {
-  float light, own_mean, other_mean, residual, each, least, most, steps[4];
-};
+// Step 5, of a channel.
+using Moved = torchdof::MixedPixel<float, CHANNELS>::Moved;
 __device__ inline Moved moved_of(const Run &r, const Pixel &p, const Split &s, int c) {
-  Moved m;
-  const float own = 1 - s.weight;
-  m.light = s.light(r, p, c);
-  m.own_mean = s.by_owner(s.seen.near[c], s.seen.far[c]), m.other_mean = s.by_owner(s.seen.far[c], s.seen.near[c]);
-  m.residual = m.light - own * m.own_mean - s.weight * m.other_mean;
-  m.each = s.lent * s.weight / (s.weight * s.weight + own * own);
-  m.least = torchdof::max(r.darkest[p.item * CHANNELS + c] / s.scale, -UNBOUNDED);
-  m.most = torchdof::min(r.brightest[p.item * CHANNELS + c] / s.scale, UNBOUNDED);
-  m.least = torchdof::min(m.least, UNBOUNDED), m.most = torchdof::max(m.most, -UNBOUNDED);
-  m.steps[0] = s.weight * (m.other_mean + m.residual * m.each);
-  m.steps[1] = torchdof::max(m.steps[0], m.light - own * m.most);
-  m.steps[2] = torchdof::min(m.steps[1], m.light - own * m.least);
-  m.steps[3] = torchdof::max(m.steps[2], s.weight * m.least);
-  return m;
+  const int end = p.item * CHANNELS + c;
+  return s.mixed.moved(s.own_light[c], s.seen.near[c], s.seen.far[c], r.darkest[end] / s.scale, r.brightest[end] / s.scale);
 }

@@ -57,6 +57,26 @@ def scene(shift: int = 0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return image, coc, cover, truth
 
 
+def uneven_scene() -> tuple[Tensor, Tensor, Tensor]:
+    """Image, coc and coverage: surfaces that slope and meet, in part soft, displaced by 2 px, with a third one."""
+    cover, (figure, wall) = strands(), layers()
+    y, x = torch.meshgrid(*(torch.arange(float(n)) for n in SIZE), indexing="ij")
+    far = torch.where(y > 56, 6.0, 0.03 * (x - 40.0) + 0.02 * y)
+    coc = torch.where(displaced(cover, 2) >= 0.5, 0.18 * x - 9.0, far)
+    soft = functional.avg_pool2d(functional.pad(coc, (2, 2, 2, 2), mode="replicate"), 5, 1)
+    coc = torch.where(y % 48 < 24, coc, soft)
+    coc = torch.where((x - 90).abs() + (y - 30).abs() < 9, -16.0, coc)
+    return cover * figure + (1.0 - cover) * wall, coc, cover
+
+
+def test_both_surfaces_of_an_uneven_scene_have_the_recorded_coc() -> None:
+    """A change of the rules that changes what is found must record the new means here."""
+    moved, covered = covered_by(*uneven_scene(), threshold)
+    assert covered is not None
+    means = [float(values.double().mean()) for values in (moved, covered[:, 3], covered[:, 5])]
+    assert means == pytest.approx([0.23652, -1.19772, 0.18584], abs=2e-5)
+
+
 @pytest.mark.parametrize(("shift", "gain_db"), [(0, 6.0), (2, 14.0), (-2, 14.0)])
 def test_true_coverage_renders_strands_before_a_wall_in_focus(shift: int, gain_db: float, engine: str) -> None:
     """A strand may have the colour of the wall, and a displaced map has strands in other places."""

@@ -18,6 +18,7 @@
 #include "highlights.h"
 #include "job.h"
 #include "light.h"
+#include "mixed_pixel.h"
 #include "rules.h"
 #include "simd.h"
 #include "surfaces.h"
@@ -248,17 +249,10 @@ void clean_light(const Frame &frame, int y0, int x0, Window &w, const float *fal
 
 // Splits LANES pixels of a row.
 //
-// 1. The near and far coc are the extremes of the 3 x 3 neighbours.
+// 1. The coc of both surfaces are the extremes of the 3 x 3 neighbours.
 // 2. The colour of each surface is the mean of its neighbours. Their light moves towards their clean light, along the
-// line
-//    between the clean colours of both surfaces, and less where texture is strong.
-// 3. The share of the near surface is the projection of the pixel's colour onto the line between both colours.
-// 4. The share of the other surface is at most 1/2. Where texture makes the projection unreliable, it is the share that
-//    the other surface has under a small Gaussian, unless this contradicts the pixel's colour. It may where the map as
-//    given has no edge; then the surfaces have their own colours.
-// 5. The residual colour goes to both surfaces in proportion to their shares, none of it to an other surface that is
-// less
-//    blurred, within the range of the image's light.
+//    line between the clean colours of both surfaces, and less where texture is strong.
+// 3. mixed_pixel.h has the other steps.
 template <int CHANNELS>
 class Split {
  public:
@@ -267,11 +261,9 @@ class Split {
         in_coc_(first_ + PITCH + 1), masked_(frame.valid), ends_(w, in_coc_, masked_) {
     vec *memory = w.around.data();
     for (vec **colours : {&light_, &clean_, &d_light_, &d_clean_}) *colours = memory, memory += C() * TAPS;
-    for (vec **colours :
-         {&front_, &behind_, &colour_, &clean_front_, &clean_behind_, &d_front_, &d_behind_, &d_colour_, &d_contrast_})
+    for (vec **colours : {&near_, &far_, &own_, &clean_near_, &clean_far_, &d_near_, &d_far_, &d_own_, &d_contrast_})
       *colours = memory, memory += C();
     find_colours();
-    weigh();
   }
 
   // Writes the surfaces of the pixels `beside` another surface.
@@ -280,49 +272,31 @@ class Split {
       float *const to = plane + y_ * BLOCK + x_;
       store(to, beside ? value : load<vec>(to));
     };
-    const vec own = 1.0f - weight_, per_own = 1.0f / own, per_other = 1.0f / max(weight_, broadcast(1e-12f));
     for (int c = 0; c < C(); c++) {
-      const vec others = Other(*this, c).light;
-      put(block.own + c * BLOCK_PIXELS, (colour_[c] - others) * per_own * scale_);
-      put(block.other + c * BLOCK_PIXELS, select(weight_ > vec{}, others * per_other) * scale_);
+      const auto moved = moved_of(c);
+      put(block.own + c * BLOCK_PIXELS, mixed_.own_light(moved) * scale_);
+      put(block.other + c * BLOCK_PIXELS, mixed_.other_light(moved) * scale_);
     }
     const vec valid = valid_[TAPS / 2];
-    put(block.coc, is_near_ ? ends_.far : ends_.near);
-    put(block.weight, weight_ * valid);
-    put(block.own_weight, own * valid);
+    put(block.coc, mixed_.by_owner(ends_.far, ends_.near));
+    put(block.weight, mixed_.weight * valid);
+    put(block.own_weight, (1.0f - mixed_.weight) * valid);
   }
 
   // Adds the gradients by the surfaces of these pixels to those by the window.
   void back(Slopes &slopes, ivec beside) {
     std::fill(d_light_, d_light_ + 2 * C() * TAPS, vec{});
-    std::fill(d_front_, d_front_ + 4 * C(), vec{});
-    back_of_parts(slopes, beside);
-    back_of_weight();
+    std::fill(d_near_, d_near_ + 4 * C(), vec{});
+    back_of_surfaces(slopes, beside);
     back_of_colours(slopes);
   }
 
  private:
-  // The light of the other surface, times its weight: in proportion to both weights, within the range of the image.
-  struct Other {
-    vec own_mean, mean, unexplained, d_each, darkest, brightest, own_darkest, own_brightest, light;
-    vec steps[4];  // the light after each limit but the last
+  using Mixed = MixedPixel<vec, CHANNELS>;
 
-    Other(const Split &s, int c) {
-      const vec weight = s.weight_, own = 1.0f - weight;
-      own_mean = s.is_near_ ? s.front_[c] : s.behind_[c], mean = s.is_near_ ? s.behind_[c] : s.front_[c];
-      unexplained = s.colour_[c] - own * own_mean - weight * mean;
-      d_each = s.lent_ * weight / (weight * weight + own * own);
-      darkest = max(s.frame_.darkest[c] / s.scale_, broadcast(-UNBOUNDED)),
-      brightest = min(s.frame_.brightest[c] / s.scale_, broadcast(UNBOUNDED));
-      own_darkest = s.colour_[c] - own * darkest, own_brightest = s.colour_[c] - own * brightest;
-      // the two parts still sum to the pixel, and neither is brighter or darker than the image
-      steps[0] = weight * (mean + unexplained * d_each);
-      steps[1] = max(steps[0], own_brightest);
-      steps[2] = min(steps[1], own_darkest);
-      steps[3] = max(steps[2], weight * darkest);
-      light = min(steps[3], weight * brightest);
-    }
-  };
+  typename Mixed::Moved moved_of(int c) const {
+    return mixed_.moved(own_[c], near_[c], far_[c], frame_.darkest[c] / scale_, frame_.brightest[c] / scale_);
+  }
 
   // Weighted mean of the light around pixels [channels, TAPS]. Returns its variance, summed over channels.
   vec mean(const vec *light, const vec *weight, vec *mean) const {
@@ -367,23 +341,23 @@ class Split {
         scale_ = max(scale_, abs(light_[c * TAPS + i]));
       }
     for (int i = 0; i < C() * TAPS; i++) light_[i] /= scale_;
-    for (int c = 0; c < C(); c++) colour_[c] = light_[c * TAPS + TAPS / 2];
+    for (int c = 0; c < C(); c++) own_[c] = light_[c * TAPS + TAPS / 2];
 
-    here_ = load<vec>(w_.coc + in_coc_ + tap(TAPS / 2));
-    gap_ = max(ends_.far - ends_.near, broadcast(1e-6f));
+    mixed_.coc = load<vec>(w_.coc + in_coc_ + tap(TAPS / 2));
+    mixed_.gap = max(ends_.far - ends_.near, broadcast(1e-6f));
     vec counted = {};  // sum of the weights of the small Gaussian
-    covered_ = vec{};
+    mixed_.covered = vec{};
     for (int i = 0; i < TAPS; i++) {
       const vec weight = (broadcast(1.0f + UNCLEAN) - load<vec>(w_.edge + first_ + tap(i))) * falloff_[i] * valid_[i];
       const vec nearness = (ends_.far - load<vec>(w_.coc + in_coc_ + tap(i))) /
-                           gap_;  // not times 1 / gap, whose rounding the clamps below enlarge
+                           mixed_.gap;  // not times 1 / gap, whose rounding the clamps below enlarge
       nearer_[i] = weight * on_near(nearness);
       farther_[i] = weight * on_far(nearness);
       small_[i] = (i == TAPS / 2 ? 1.0f : i % 2 ? SOFTNESS_FALLOFF : SOFTNESS_DIAGONAL) * valid_[i];
-      covered_ += small_[i] * nearness, counted += small_[i];
+      mixed_.covered += small_[i] * nearness, counted += small_[i];
     }
     per_counted_ = 1.0f / max(counted, broadcast(1e-12f));
-    covered_ *= per_counted_;
+    mixed_.covered *= per_counted_;
 
     const vec per_scale = 1.0f / scale_;
     for (int c = 0; c < C(); c++)
@@ -391,12 +365,11 @@ class Split {
         const vec relative = load<vec>(&w_.clean[c * plane + first_ + tap(i)]) * per_scale;
         clean_[c * TAPS + i] = max(min(relative, broadcast(MOST_CLEAN)), broadcast(-MOST_CLEAN));
       }
-    clean_far_variance_ = mean(clean_, farther_, clean_behind_),
-    clean_near_variance_ = mean(clean_, nearer_, clean_front_);
+    clean_far_variance_ = mean(clean_, farther_, clean_far_), clean_near_variance_ = mean(clean_, nearer_, clean_near_);
     vec strength = {};
     for (vec &shift : shift_) shift = vec{};
     for (int c = 0; c < C(); c++) {
-      const vec contrast = clean_front_[c] - clean_behind_[c];
+      const vec contrast = clean_near_[c] - clean_far_[c];
       strength += contrast * contrast;
       for (int i = 0; i < TAPS; i++) shift_[i] += (light_[c * TAPS + i] - clean_[c * TAPS + i]) * contrast;
     }
@@ -404,152 +377,42 @@ class Split {
     for (int i = 0; i < TAPS; i++) {
       shift_[i] *= per_strength_;
       const vec shift = limited_shift(i);
-      for (int c = 0; c < C(); c++) light_[c * TAPS + i] -= shift * (clean_front_[c] - clean_behind_[c]);
+      for (int c = 0; c < C(); c++) light_[c * TAPS + i] -= shift * (clean_near_[c] - clean_far_[c]);
     }
-    far_variance_ = mean(light_, farther_, behind_);
-    near_variance_ = mean(light_, nearer_, front_);
+    far_variance_ = mean(light_, farther_, far_);
+    near_variance_ = mean(light_, nearer_, near_);
+
+    mixed_.near_px = ends_.near, mixed_.far_px = ends_.far, mixed_.channels = C();
+    mixed_.edge = load<vec>(w_.edge + first_ + tap(TAPS / 2));
+    mixed_.variance = far_variance_ + near_variance_;
+    mixed_.weigh(own_, near_, far_);
   }
 
   // Light of the other surface in a neighbour, as a multiple of the contrast between the clean colours.
   vec limited_shift(int i) const { return nearer_[i] > farther_[i] ? -clamp01(-shift_[i]) : clamp01(shift_[i]); }
 
-  void weigh() {
-    vec along = {};
-    strength_ = misfit_ = vec{};
-    for (int c = 0; c < C(); c++) {
-      const vec contrast = front_[c] - behind_[c];
-      strength_ += contrast * contrast;
-      along += (colour_[c] - behind_[c]) * contrast;
-    }
-    is_near_ = here_ - ends_.near < ends_.far - here_;
-    along_ = along / max(strength_, broadcast(1e-12f)), fitted_ = clamp01(along_);
-    for (int c = 0; c < C(); c++) {
-      const vec left = colour_[c] - behind_[c] - fitted_ * (front_[c] - behind_[c]);
-      misfit_ += left * left;
-    }
-    sharper_ = abs(here_) - abs(is_near_ ? ends_.far : ends_.near), lent_ = 1.0f - clamp01(sharper_);
-    noise_ = far_variance_ + near_variance_ + ALIKE * ALIKE;
-    total_ = strength_ + TRUST * (far_variance_ + near_variance_ + misfit_) + ALIKE * ALIKE;
-    trust_ = strength_ / total_;
-    edge_ = load<vec>(w_.edge + first_ + tap(TAPS / 2));
-    sided_ = abs((here_ - ends_.near) - (ends_.far - here_)) * (1.0f / gap_);
-    clear_ = edge_ * clamp01(unlimited_sided(sided_)),
-    contradiction_ = misfit_ + (covered_ - fitted_) * (covered_ - fitted_) * strength_;
-    by_fit_ = is_near_ ? 1.0f - fitted_ : fitted_, by_cover_ = is_near_ ? 1.0f - covered_ : covered_;
-    wide_ = gap_ * (1.0f / EDGE_PX) - 2.0f;
-    geometric_ = min(by_cover_, broadcast(0.5f)) * clear_ * (1.0f - trust_) * clamp01(wide_);
-    weight_ = min(by_fit_, broadcast(0.5f)) * (clear_ * trust_) + geometric_ * noise_ / (noise_ + contradiction_);
-  }
-
-  // The gradients by the weight and the colours, from those by the surfaces.
-  void back_of_parts(Slopes &slopes, ivec beside) {
+  // Steps 5 to 3 back: the gradients by the colours, by the pixel's light and by coc, from those by the surfaces.
+  void back_of_surfaces(Slopes &slopes, ivec beside) {
     const auto slope = [&](int plane) {
       return select(beside, load<vec>(&slopes.surfaces[plane * BLOCK * PITCH + y_ * PITCH + x_]));
     };
-    const vec own = 1.0f - weight_, known = max(weight_, broadcast(1e-12f)), squares = weight_ * weight_ + own * own;
-    vec d_own = {}, d_lent = {};
-    d_weight_ = slope(2 * C() + 1);
-    const vec d_coc = slope(2 * C());
-    d_near_ = select(~is_near_, d_coc), d_far_ = select(is_near_, d_coc);
+    d_ = OfMixedPixel<vec>{};
+    d_.weight = slope(2 * C() + 1);
     for (int c = 0; c < C(); c++) {
-      const Other other(*this, c);
-      const vec own_light = (colour_[c] - other.light) / own, other_light = other.light / known;
-      const vec d_own_light = slope(c) * scale_, d_other_light = select(weight_ > vec{}, slope(C() + c) * scale_);
-      const vec d_part = d_own_light / own;
-      vec d_colour = d_part, d_mean = {};
-      d_own -= d_part * own_light;
-      // by the other surface's light, and by its weight where the own part depends on their product
-      vec d_light = d_other_light - d_part * weight_;
-      d_weight_ -= d_part * other_light;
-      // the gradient goes to the limit in force, or by halves to two equal ones
-      const auto limited = [&](vec light, vec limit, bool upper) {
-        const vec by_limit = select(upper ? limit < light : limit > light, broadcast(1.0f)) +
-                             select(limit == light, broadcast(0.5f)),
-                  taken = d_light * by_limit;
-        d_light -= taken;
-        return taken;
-      };
-      vec d_brightest = limited(other.steps[3], weight_ * other.brightest, true),
-          d_darkest = limited(other.steps[2], weight_ * other.darkest, false);
-      const vec by_darkest = limited(other.steps[1], other.own_darkest, true) / known,
-                by_brightest = limited(other.steps[0], other.own_brightest, false) / known;
-      d_colour += by_darkest + by_brightest;
-      d_own -= by_darkest * other.darkest + by_brightest * other.brightest;
-      d_weight_ -= (by_darkest + by_brightest) * other_light;
-      d_darkest -= by_darkest * own, d_brightest -= by_brightest * own;
-      slopes.darkest[c] += reduce_add(select(beside & (other.darkest > -UNBOUNDED), d_darkest / scale_));
-      slopes.brightest[c] += reduce_add(select(beside & (other.brightest < UNBOUNDED), d_brightest / scale_));
-      // light = mean + unexplained d_each, d_each = lent weight / (weight^2 + own^2)
-      const vec d_each = d_light * other.unexplained * lent_, d_unexplained = d_light * other.d_each;
-      d_lent += d_light * other.unexplained * weight_ / squares;
-      d_colour += d_unexplained;
-      d_mean += d_light - d_unexplained * weight_;
-      d_own -= d_unexplained * other.own_mean + d_each * 2.0f * weight_ * own / (squares * squares);
-      d_weight_ += d_each * (own * own - weight_ * weight_) / (squares * squares) - d_unexplained * other.mean;
-      const vec d_own_mean = -d_unexplained * own;
-      d_front_[c] += is_near_ ? d_own_mean : d_mean;
-      d_behind_[c] += is_near_ ? d_mean : d_own_mean;
-      d_colour_[c] += d_colour;
+      const auto of_end = mixed_.back_of_moved(moved_of(c), slope(c) * scale_, slope(C() + c) * scale_, d_, d_own_[c],
+                                               d_near_[c], d_far_[c]);
+      const auto is_bounded = [&](float end) { return beside & (abs(end / scale_) <= UNBOUNDED); };
+      slopes.darkest[c] += reduce_add(select(is_bounded(frame_.darkest[c]), of_end.darkest / scale_));
+      slopes.brightest[c] += reduce_add(select(is_bounded(frame_.brightest[c]), of_end.brightest / scale_));
     }
-    // lent = 1 - sharper, sharper = |here| - |other coc|
-    const auto sign = [](vec value) {
-      return select(value > vec{}, broadcast(1.0f)) - select(value < vec{}, broadcast(1.0f));
-    };
-    const vec d_sharper = select(within(sharper_), -d_lent),
-              d_other = -d_sharper * sign(is_near_ ? ends_.far : ends_.near);
-    d_here_ = d_sharper * sign(here_);
-    d_near_ += select(~is_near_, d_other), d_far_ += select(is_near_, d_other);
-    d_weight_ -= d_own;
-  }
-
-  // The gradients by the colours and by coverage, edge and coc, from those by the weight.
-  void back_of_weight() {
-    const vec sum = noise_ + contradiction_, agreeing = noise_ / sum, d_geometric = d_weight_ * agreeing;
-    const vec d_agreeing = d_weight_ * geometric_ / sum, d_contradiction = -d_agreeing * agreeing;
-    const vec by_cover = min(by_cover_, broadcast(0.5f)), by_fit = min(by_fit_, broadcast(0.5f)), wide = clamp01(wide_),
-              doubt = 1.0f - trust_;
-    const vec d_clear = d_geometric * by_cover * doubt * wide + d_weight_ * by_fit * trust_;
-    const vec d_trust = (d_weight_ * by_fit - d_geometric * by_cover * wide) * clear_;
-    const vec d_by_cover = select(by_cover_ <= 0.5f, d_geometric * clear_ * doubt * wide),
-              d_by_fit = select(by_fit_ <= 0.5f, d_weight_ * clear_ * trust_);
-    const vec off = covered_ - fitted_, d_off = d_contradiction * 2.0f * off * strength_;
-    d_covered_ = d_off + (is_near_ ? -d_by_cover : d_by_cover);
-    vec d_fitted = (is_near_ ? -d_by_fit : d_by_fit) - d_off;
-    d_edge_ = d_clear * clamp01(unlimited_sided(sided_));
-    const vec side = sign((here_ - ends_.near) - (ends_.far - here_));
-    const vec d_sided = select(within(unlimited_sided(sided_)), d_clear * edge_ * PLACE_SLOPE) / gap_;
-    d_here_ += 2.0f * side * d_sided;
-    d_near_ -= side * d_sided, d_far_ -= side * d_sided;
-    d_gap_ = select(within(wide_), d_geometric * by_cover * clear_ * doubt * (1.0f / EDGE_PX)) - d_sided * sided_;
-    const vec d_total = -d_trust * trust_ / total_, d_noisy = d_total * TRUST;
-    vec d_strength = d_trust / total_ + d_total + d_contradiction * off * off;
-    const vec d_misfit = d_contradiction + d_noisy;
-    d_variance_ = d_noisy + d_agreeing * (1.0f - agreeing);
-    for (int c = 0; c < C(); c++) {
-      const vec contrast = front_[c] - behind_[c],
-                d_left = 2.0f * d_misfit * (colour_[c] - behind_[c] - fitted_ * contrast);
-      d_colour_[c] += d_left;
-      d_behind_[c] -= d_left;
-      d_fitted -= d_left * contrast;
-    }
-    const vec d_along = select(within(along_), d_fitted) / max(strength_, broadcast(1e-12f));
-    d_strength -= select(strength_ >= broadcast(1e-12f), d_along * along_);
-    const vec d_misfit_contrast = 2.0f * d_misfit * fitted_;
-    for (int c = 0; c < C(); c++) {
-      const vec contrast = front_[c] - behind_[c], left = colour_[c] - behind_[c];
-      const vec d_contrast =
-          d_along * left + 2.0f * d_strength * contrast - d_misfit_contrast * (left - fitted_ * contrast);
-      d_colour_[c] += d_along * contrast;
-      d_front_[c] += d_contrast;
-      d_behind_[c] -= d_along * contrast + d_contrast;
-    }
+    mixed_.back_of_weight(own_, near_, far_, slope(2 * C()), d_, d_own_, d_near_, d_far_);
   }
 
   // The gradients by light, clean light, edges and coc of the window, from those by the colours.
   void back_of_colours(Slopes &slopes) {
     vec d_nearer[TAPS] = {}, d_farther[TAPS] = {};
-    back_of_mean(light_, nearer_, front_, near_variance_, d_front_, d_variance_, d_light_, d_nearer);
-    back_of_mean(light_, farther_, behind_, far_variance_, d_behind_, d_variance_, d_light_, d_farther);
+    back_of_mean(light_, nearer_, near_, near_variance_, d_near_, d_.variance, d_light_, d_nearer);
+    back_of_mean(light_, farther_, far_, far_variance_, d_far_, d_.variance, d_light_, d_farther);
     back_of_clean_colours(d_nearer, d_farther);
     back_of_taps(d_nearer, d_farther, slopes);
   }
@@ -563,7 +426,7 @@ class Split {
       const vec shift = limited_shift(i);
       vec d_shift = {}, along = {};
       for (int c = 0; c < C(); c++) {
-        const vec contrast = clean_front_[c] - clean_behind_[c],
+        const vec contrast = clean_near_[c] - clean_far_[c],
                   off = light_[c * TAPS + i] + shift * contrast - clean_[c * TAPS + i];
         d_shift -= d_light_[c * TAPS + i] * contrast;
         d_contrast_[c] -= d_light_[c * TAPS + i] * shift;
@@ -573,7 +436,7 @@ class Split {
       d_per_strength += d_shift * along;
       d_shift *= per_strength_;
       for (int c = 0; c < C(); c++) {
-        const vec contrast = clean_front_[c] - clean_behind_[c],
+        const vec contrast = clean_near_[c] - clean_far_[c],
                   off = light_[c * TAPS + i] + shift * contrast - clean_[c * TAPS + i];
         d_light_[c * TAPS + i] += d_shift * contrast;
         d_clean_[c * TAPS + i] -= d_shift * contrast;
@@ -582,20 +445,18 @@ class Split {
     }
     const vec d_strength = -d_per_strength * per_strength_ * per_strength_;
     for (int c = 0; c < C(); c++) {
-      d_contrast_[c] += 2.0f * d_strength * (clean_front_[c] - clean_behind_[c]);
-      d_front_[c] = d_contrast_[c], d_behind_[c] = -d_contrast_[c];
+      d_contrast_[c] += 2.0f * d_strength * (clean_near_[c] - clean_far_[c]);
+      d_near_[c] = d_contrast_[c], d_far_[c] = -d_contrast_[c];
     }
-    back_of_mean(clean_, nearer_, clean_front_, clean_near_variance_, d_front_, TEXTURE * d_strength, d_clean_,
-                 d_nearer);
-    back_of_mean(clean_, farther_, clean_behind_, clean_far_variance_, d_behind_, TEXTURE * d_strength, d_clean_,
-                 d_farther);
+    back_of_mean(clean_, nearer_, clean_near_, clean_near_variance_, d_near_, TEXTURE * d_strength, d_clean_, d_nearer);
+    back_of_mean(clean_, farther_, clean_far_, clean_far_variance_, d_far_, TEXTURE * d_strength, d_clean_, d_farther);
   }
 
   // Adds the gradients by the pixels of the window, from those by the weights of both surfaces.
   void back_of_taps(const vec *d_nearer, const vec *d_farther, Slopes &slopes) {
     const vec per_scale = 1.0f / scale_;
     for (int c = 0; c < C(); c++) {
-      d_light_[c * TAPS + TAPS / 2] += d_colour_[c];
+      d_light_[c * TAPS + TAPS / 2] += d_own_[c];
       for (int i = 0; i < TAPS; i++) {
         const int at = c * EDGES * PITCH + first_ + tap(i);
         add(&slopes.light[at], d_light_[c * TAPS + i] * per_scale);
@@ -603,23 +464,23 @@ class Split {
             select(abs(load<vec>(&w_.clean[at]) * per_scale) <= MOST_CLEAN, d_clean_[c * TAPS + i] * per_scale));
       }
     }
-    add(slopes.edge + first_ + tap(TAPS / 2), d_edge_);
+    add(slopes.edge + first_ + tap(TAPS / 2), d_.edge);
     for (int i = 0; i < TAPS; i++) {
       const int in_coc = in_coc_ + tap(i);
       const vec near_by = falloff_[i] * valid_[i],
                 weight = (broadcast(1.0f + UNCLEAN) - load<vec>(w_.edge + first_ + tap(i))) * near_by;
-      const vec nearness = (ends_.far - load<vec>(w_.coc + in_coc)) / gap_, to_near = unlimited_on_near(nearness),
+      const vec nearness = (ends_.far - load<vec>(w_.coc + in_coc)) / mixed_.gap, to_near = unlimited_on_near(nearness),
                 to_far = unlimited_on_far(nearness);
       add(slopes.edge + first_ + tap(i), -near_by * (d_nearer[i] * clamp01(to_near) + d_farther[i] * clamp01(to_far)));
       const vec d_ends =
           PLACE_SLOPE * weight * (select(within(to_near), d_nearer[i]) - select(within(to_far), d_farther[i]));
-      const vec d_nearness = (d_ends + d_covered_ * small_[i] * per_counted_) / gap_;
+      const vec d_nearness = (d_ends + d_.covered * small_[i] * per_counted_) / mixed_.gap;
       add(slopes.coc + in_coc, -d_nearness);
-      d_far_ += d_nearness;
-      d_gap_ -= d_nearness * nearness;
+      d_.far_px += d_nearness;
+      d_.gap -= d_nearness * nearness;
     }
-    add(slopes.coc + in_coc_ + tap(TAPS / 2), d_here_);
-    ends_.back(w_, in_coc_, masked_, d_near_ - d_gap_, d_far_ + d_gap_, slopes.coc);
+    add(slopes.coc + in_coc_ + tap(TAPS / 2), d_.coc);
+    ends_.back(w_, in_coc_, masked_, d_.near_px - d_.gap, d_.far_px + d_.gap, slopes.coc);
   }
 
   int C() const { return CHANNELS ? CHANNELS : frame_.channels; }
@@ -631,19 +492,15 @@ class Split {
       in_coc_;  // place in the block; of the first neighbour in windows of edges and light, and of coc
   const bool masked_;
   const Ends ends_;
-  vec *light_, *clean_, *d_light_, *d_clean_;  // of the neighbours [channels, TAPS]; gradients begin with of_
-  vec *front_, *behind_, *colour_, *clean_front_, *clean_behind_, *d_front_, *d_behind_, *d_colour_,
-      *d_contrast_;  // [channels]
+  vec *light_, *clean_, *d_light_, *d_clean_;  // of the neighbours [channels, TAPS]; gradients begin with d_
+  vec *near_, *far_, *own_, *clean_near_, *clean_far_, *d_near_, *d_far_, *d_own_, *d_contrast_;  // [channels]
   vec valid_[TAPS], small_[TAPS];
-  vec nearer_[TAPS], farther_[TAPS];                               // weights in the means of both surfaces
-  vec shift_[TAPS];                                                // not limited
-  vec scale_, here_, gap_, covered_, per_counted_, per_strength_;  // covered: by the near surface
+  vec nearer_[TAPS], farther_[TAPS];  // weights in the means of both surfaces
+  vec shift_[TAPS];                   // not limited
+  vec scale_, per_counted_, per_strength_;
   vec clean_near_variance_, clean_far_variance_, near_variance_, far_variance_;
-  ivec is_near_;
-  vec sharper_, lent_;  // px by which the other surface is less blurred; share of the residual that it may get, 0 to 1
-  vec strength_, along_, fitted_, misfit_, noise_, total_, trust_, edge_, sided_, clear_, contradiction_, by_fit_,
-      by_cover_, wide_, geometric_, weight_;
-  vec d_weight_, d_variance_, d_covered_, d_edge_, d_here_, d_gap_, d_near_, d_far_;
+  Mixed mixed_;
+  OfMixedPixel<vec> d_;
 };
 
 void read_light(const Frame &frame, int y0, int x0, Window &w) {

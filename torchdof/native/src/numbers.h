@@ -14,6 +14,14 @@ inline V min(V a, V b) {
   return a < b ? a : b;
 }
 template <typename V>
+inline V absolute(V v) {
+  return max(v, -v);
+}
+template <typename V>
+inline V sign(V v) {  // 0 of 0
+  return v > V{} ? V{} + 1.0f : v < V{} ? V{} - 1.0f : V{};
+}
+template <typename V>
 inline V clamp01(V v) {
   return min(max(v, V{}), V{} + 1.0f);
 }

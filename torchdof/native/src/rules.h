@@ -34,7 +34,7 @@ inline auto within(V v) {
 // min(|near|, |far|). render/surfaces/matting.py, _apart_px.
 template <typename V>
 inline V apart_px(V near, V far) {
-  return far - near - SAME_BLUR * min(max(near, -near), max(far, -far));
+  return far - near - SAME_BLUR * min(absolute(near), absolute(far));
 }
 
 // Blur from which a near surface is clearly more blurred than, and thus in front of, a pixel with this blur.
@@ -75,10 +75,10 @@ inline V unlimited_sided(V sided) {
 // derivative. render/surfaces/disocclusion.py, end_of_surface.
 template <typename V>
 inline V end_of_surface(V coc) {
-  return coc + max(max(coc, -coc) * OWN_SLOPE - BEHIND_PX, V{});
+  return coc + max(absolute(coc) * OWN_SLOPE - BEHIND_PX, V{});
 }
 inline float slope_of_end(float coc) {
-  return OWN_SLOPE * max(coc, -coc) >= BEHIND_PX ? 1.0f + (coc < 0 ? -OWN_SLOPE : OWN_SLOPE) : 1.0f;
+  return OWN_SLOPE * absolute(coc) >= BEHIND_PX ? 1.0f + (coc < 0 ? -OWN_SLOPE : OWN_SLOPE) : 1.0f;
 }
 
 // Confidence that a surface whose coc is larger by d is another surface: clamp(d - BEHIND_PX + 1/2, 0, 1).

@@ -51,7 +51,6 @@ inline float reduce_max(vec v) {
 }
 inline float reduce_min(vec v) { return -reduce_max(-v); }
 inline vec abs(vec v) { return (vec)((ivec)v & 0x7fffffff); }
-inline vec sign(vec v) { return v > vec{} ? broadcast(1.0f) : v < vec{} ? broadcast(-1.0f) : vec{}; }
 typedef float quad __attribute__((vector_size(16)));
 inline float reduce_add(vec v) {
   quad parts[LANES / 4];
