@@ -11,7 +11,7 @@ solution. Nodes are added until profiles interpolated between them fit the spots
 import datetime
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -96,29 +96,7 @@ def trace_table(
         BlurTable('double_gauss_50mm_f4', radial, 5 nodes)
     """
     arguments = dict(locals())
-    if not isinstance(lens, Lens):
-        raise ValueError(f"lens must be a Lens, got {show(lens)}; read one with Lens.read()")
-    number("focus_m", focus_m, 0, unit="metres", infinite=True)
-    number("field_mm", field_mm, -1e6, 1e6)
-    number("sensor_width_mm", sensor_width_mm, 1e-6, 1e9, unit="millimetres")
-    number("width_px", width_px, 0, 1e9, unit="pixels")
-    if nodes is not None:
-        whole("nodes", nodes, 5 if math.isfinite(focus_m) else 3, 1000)
-    for key, low, high in (("points", 3, 1000), ("field_nodes", 2, 100), ("field_rays", 1000, 10**7)):
-        whole(key, arguments[key], low, high)
-    if wavelengths_um is not None:
-        if not isinstance(wavelengths_um, list | tuple) or not wavelengths_um:
-            raise ValueError(f"wavelengths_um must be a list of micrometres, got {show(wavelengths_um)}")
-        for value in wavelengths_um:
-            lens.indices(number("wavelengths_um", value, unit="micrometres"))
-        if np.array_equal(lens.indices(F_UM), lens.indices(C_UM)):
-            raise ValueError(f"wavelengths_um need a lens with Abbe numbers (index/V); {lens.name!r} has none")
-    if field is not None:
-        if field_mm:
-            raise ValueError("field_mm averages one place, field traces several: give one of them")
-        is_list = isinstance(field, list | tuple) and len(field) > 1 and field[0] == 0
-        if not is_list or not all(low < number("field", high, 0, 1e6, unit="mm") for low, high in pairwise(field)):
-            raise ValueError(f"field must be increasing distances in mm from the middle, from 0 on, got {show(field)}")
+    _refuse(**arguments)
     stopped = lens.with_f_number(f_number)
     focal = lens.paraxial().focal_length
     sensor = focus_sensor(stopped, focus_m, focus)
@@ -149,21 +127,11 @@ def trace_table(
         places = coc_nodes(near, far, field_nodes), field or ()
         spots = None if field is None else trace_field(stopped, sensor, distance, *places, wavelengths_um, field_rays)
     arguments |= {"nearest_m": nearest_m, "rays": rays}
-    call = ", ".join(f"{key}={value!r}" for key, value in arguments.items() if key != "lens")
-    provenance = {
-        "lens": lens.name,
-        "source": lens.source,
-        "prescription": "; ".join(lens.lines()),
+    made = {
         "focal_length_mm": round(focal, 4),
         "f_number_paraxial": round(stopped.paraxial().f_number, 4),
-        **{key: arguments[key] for key in ("f_number", "focus", "field_mm")},
-        "focus_m": focus_m if math.isfinite(focus_m) else "inf",
         "nearest_m": round(nearest_m, 6),
-        "wavelengths_um": list(wavelengths_um or ()) or "d line",
         "asymmetry": [round(channels[-1].spot(coc).asymmetry, 4) for coc in cocs] if field_mm else 0.0,
-        "fitted_for": f"{width_px} px on {sensor_width_mm:g} mm; geometric spots, no diffraction",
-        "date": datetime.date.today().isoformat(),
-        "command": f"torchdof.fit.trace_table(Lens.read({lens.name!r}), {call})",
     }
     return BlurTable(
         "radial",
@@ -175,10 +143,65 @@ def trace_table(
         unit="mm",
         sensor_width_mm=sensor_width_mm,
         name=f"{lens.name}_f{f_number:g}" if name is None else name,
-        provenance=provenance,
+        provenance=_provenance(arguments) | made,
         residual=_rounded(np.sqrt(np.mean(np.square(residuals), axis=0))),
         field=spots,
     )
+
+
+def _refuse(
+    lens: Lens,
+    focus_m: float,
+    field_mm: float,
+    sensor_width_mm: float,
+    width_px: int,
+    nodes: int | None,
+    wavelengths_um: Sequence[float] | None,
+    field: Sequence[float] | None,
+    **others: Any,
+) -> None:
+    """Refuses arguments of :func:`trace_table`."""
+    if not isinstance(lens, Lens):
+        raise ValueError(f"lens must be a Lens, got {show(lens)}; read one with Lens.read()")
+    number("focus_m", focus_m, 0, unit="metres", infinite=True)
+    number("field_mm", field_mm, -1e6, 1e6)
+    number("sensor_width_mm", sensor_width_mm, 1e-6, 1e9, unit="millimetres")
+    number("width_px", width_px, 0, 1e9, unit="pixels")
+    if nodes is not None:
+        whole("nodes", nodes, 5 if math.isfinite(focus_m) else 3, 1000)
+    for key, low, high in (("points", 3, 1000), ("field_nodes", 2, 100), ("field_rays", 1000, 10**7)):
+        whole(key, others[key], low, high)
+    if wavelengths_um is not None:
+        if not isinstance(wavelengths_um, list | tuple) or not wavelengths_um:
+            raise ValueError(f"wavelengths_um must be a list of micrometres, got {show(wavelengths_um)}")
+        for value in wavelengths_um:
+            lens.indices(number("wavelengths_um", value, unit="micrometres"))
+        if np.array_equal(lens.indices(F_UM), lens.indices(C_UM)):
+            raise ValueError(f"wavelengths_um need a lens with Abbe numbers (index/V); {lens.name!r} has none")
+    if field is not None:
+        if field_mm:
+            raise ValueError("field_mm averages one place, field traces several: give one of them")
+        is_list = isinstance(field, list | tuple) and len(field) > 1 and field[0] == 0
+        if not is_list or not all(low < number("field", high, 0, 1e6, unit="mm") for low, high in pairwise(field)):
+            raise ValueError(f"field must be increasing distances in mm from the middle, from 0 on, got {show(field)}")
+
+
+def _provenance(arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """What the table records of the arguments of :func:`trace_table`, and how to make it again."""
+    lens, focus_m, lines_um = arguments["lens"], arguments["focus_m"], arguments["wavelengths_um"]
+    call = ", ".join(f"{key}={value!r}" for key, value in arguments.items() if key != "lens")
+    fitted_for = f"{arguments['width_px']} px on {arguments['sensor_width_mm']:g} mm"
+    return {
+        "lens": lens.name,
+        "source": lens.source,
+        "prescription": "; ".join(lens.lines()),
+        **{key: arguments[key] for key in ("f_number", "focus", "field_mm")},
+        "focus_m": focus_m if math.isfinite(focus_m) else "inf",
+        "wavelengths_um": list(lines_um or ()) or "d line",
+        "fitted_for": f"{fitted_for}; geometric spots, no diffraction",
+        "date": datetime.date.today().isoformat(),
+        "command": f"torchdof.fit.trace_table(Lens.read({lens.name!r}), {call})",
+    }
 
 
 def _rounded(values: Any, digits: int = 6) -> Any:

@@ -1,9 +1,10 @@
 """Reads photographs of the printed target from a camera or phone, and determines distances, focus and tone curve."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import gaussian_gradient_magnitude
@@ -71,17 +72,69 @@ def read_photographs(
         OSError: a picture is damaged.
     """
     number("square_mm", square_mm, low=1e-2, high=1e5, unit="millimetres")
-    folder_name = str(folder)
-    files = sorted(p for p in Path(folder).iterdir() if p.suffix.lower() in (*_SUFFIXES, *OPTIONAL_SUFFIXES))
+    folder = Path(folder)
+    taken = _taken(_files(folder, root), folder, colours)
+    pictures, bend, errors, advice = _without_tone_curve(taken, square_mm, str(folder))
+    width = pictures[0].light.shape[1]
+    pictures, sharpest, focus_m = _at_distances(pictures, taken.settings, width, square_mm)
+    out_of_focus = [p for p in pictures if abs(p.distance_m / focus_m - 1) > _AT_FOCUS]
+    advice = [*taken.advice, *advice, *_advice(pictures, out_of_focus, sharpest, focus_m)]
+    if not out_of_focus:
+        text = "all photographs were taken at one distance: step back, without refocusing"
+        raise FitError(text, file=str(folder))
+    original = {p.file: p.light for p in taken.pictures}
+
+    def colours_of(picture: Photograph, half: int) -> Array:
+        pixels = read_image(folder / picture.file).pixels[0, :3].double().numpy()
+        return np.stack([untoned(c, bend) if len(errors) else c for c in picture.target.window(pixels, half)])
+
+    def pair(blurred: Photograph) -> Capture:
+        both = sharpest, blurred
+        half = int(WINDOW * min(p.target.side_px for p in both))
+        sharp_levels, blurred_levels = (p.target.window(original[p.file], half) for p in both)
+        return Capture(
+            sharpest.target.window(sharpest.light, half),
+            blurred.target.window(blurred.light, half),
+            blurred.distance_m,
+            files=(str(folder / sharpest.file), str(folder / blurred.file)),
+            white=1.0 if sharpest.clipped else None,
+            colours=(colours_of(sharpest, half), colours_of(blurred, half)) if colours == "each" else None,
+            uncertain=tuple((untoned(sharp_levels, b), untoned(blurred_levels, b)) for b in bend + errors),
+        )
+
+    notes = {"target_square_mm": square_mm, "pictures": [p.file for p in pictures], "sharp": sharpest.file}
+    notes |= {"tone_curve": bend.tolist(), "from_exif": list(CAMERA)}
+    camera, name = {name: taken.settings[name] for name in CAMERA}, folder.resolve().name
+    captures = Captures(tuple(map(pair, out_of_focus)), focus_m, width, **camera, name=name, notes=notes)
+    return Photographs(captures, tuple(pictures), tuple(advice))
+
+
+def _files(folder: Path, root: str | os.PathLike[str] | None) -> list[Path]:
+    """The photographs of a folder, at least two."""
+    files = sorted(p for p in folder.iterdir() if p.suffix.lower() in (*_SUFFIXES, *OPTIONAL_SUFFIXES))
     for path in files:
         if root is not None:
-            inside(path, root, folder_name)
+            inside(path, root, str(folder))
         if reason := refusal(path):
             raise FitError(reason, file=str(path))
     if len(files) < 2:
         text = f"there is neither a {MANIFEST} nor two photographs of the page that torchdof fit --target makes"
-        raise FitError(text, "manifest", folder_name)
-    pictures, advice, settings, integers = list[Photograph](), list[str](), dict[str, float](), True
+        raise FitError(text, "manifest", str(folder))
+    return files
+
+
+class _Taken(NamedTuple):
+    """Photographs that show the target, as they were taken, without distances."""
+
+    pictures: list[Photograph]
+    settings: dict[str, float]  # of the camera, by EXIF
+    are_integers: bool
+    advice: list[str]
+
+
+def _taken(files: Sequence[Path], folder: Path, colours: Colours) -> _Taken:
+    """Reads photographs, and finds the target in each."""
+    pictures, advice, settings, are_integers = list[Photograph](), list[str](), dict[str, float](), True
     for path in files:
         picture = read_image(path)
         if colours == "each" and len(picture.channels) < 3:
@@ -97,62 +150,52 @@ def read_photographs(
             raise FitError(f"is {width} px wide, others {pictures[0].light.shape[1]}: use one camera", file=str(path))
         settings = settings or camera_settings(picture.metadata, width, height)
         is_integer = picture.sample in ("8", "16")
-        integers = integers and is_integer
+        are_integers = are_integers and is_integer
         slope = gaussian_gradient_magnitude(target.window(light, int(0.06 * target.side_px) + 4), 0.7).max()
         sharpness = float(slope / (target.white - target.black))
         pictures.append(Photograph(path.name, light, target, 0.0, sharpness, is_integer and target.white > 0.98))
     if len(pictures) < 2:
-        raise FitError("; ".join(["fewer than two photographs show the target", *advice]), file=folder_name)
+        raise FitError("; ".join(["fewer than two photographs show the target", *advice]), file=str(folder))
     if missing := [name for name in CAMERA if name not in settings]:
         text = f"EXIF has no {', '.join(missing)}: share the originals, or describe them in a {MANIFEST}"
-        raise FitError(text, "manifest", folder_name)
-    bend, errors, original = np.zeros(3), np.zeros((0, 3)), {p.file: p.light for p in pictures}
-    if integers and len(pictures) >= _MIN_FOR_TONE:
+        raise FitError(text, "manifest", str(folder))
+    return _Taken(pictures, settings, are_integers, advice)
+
+
+def _without_tone_curve(
+    taken: _Taken, square_mm: float, folder: str
+) -> tuple[list[Photograph], Array, Array, list[str]]:
+    """The photographs in linear light, the tone curve that was undone, errors of its numbers, and advice."""
+    pictures, bend, errors = taken.pictures, np.zeros(3), np.zeros((0, 3))
+    if taken.are_integers and len(pictures) >= _MIN_FOR_TONE:
         bend, errors = tone_curve([(p.light, p.target) for p in pictures], square_mm)
-    elif integers:
+    elif taken.are_integers:
         text = f"{len(pictures)} photographs are too few to find a tone curve: take {_MIN_FOR_TONE} or more"
-        warn(f"{text}; it makes a kernel up to 15 % too small", "not linear", folder_name)
-    if bend.any():
-        pictures = [replace(p, light=untoned(p.light, bend)) for p in pictures]
-        pictures = [replace(p, target=find_target(p.light, file=p.file)) for p in pictures]
-        curve = ", ".join(f"{value:+.2f}" for value in bend)
-        text = f"a tone curve ({curve}) was found by the light of the dot and the edges of the square, and undone; "
-        advice.append(f"{text}blurs of a few px may still be 5 % too small; raw pictures need no such guess")
+        warn(f"{text}; it makes a kernel up to 15 % too small", "not linear", folder)
+    if not bend.any():
+        return pictures, bend, errors, []
+    pictures = [replace(p, light=untoned(p.light, bend)) for p in pictures]
+    pictures = [replace(p, target=find_target(p.light, file=p.file)) for p in pictures]
+    curve = ", ".join(f"{value:+.2f}" for value in bend)
+    text = f"a tone curve ({curve}) was found by the light of the dot and the edges of the square, and undone; "
+    advice = f"{text}blurs of a few px may still be 5 % too small; raw pictures need no such guess"
+    return pictures, bend, errors, [advice]
+
+
+def _at_distances(
+    pictures: Sequence[Photograph], settings: Mapping[str, float], width: int, square_mm: float
+) -> tuple[list[Photograph], Photograph, float]:
+    """The photographs by increasing distance, the sharpest one, and the distance of the focus in metres.
+
+    That distance follows from the square's size there and the thin lens: 1 / focal length = 1 / focus + 1 / image
+    distance.
+    """
     sharpest = max(pictures, key=lambda p: p.sharpness)
     focal_px = settings["focal_length_mm"] * width / settings["sensor_width_mm"]
-    # distance of the focus, from the square's size there and the thin lens: 1/focal length = 1/focus + 1/image distance
     focus_m = (focal_px * square_mm / sharpest.target.side_px + settings["focal_length_mm"]) / 1000
     image_px = focal_px / (1 - settings["focal_length_mm"] / 1000 / focus_m)
-    pictures = [replace(p, distance_m=image_px * square_mm / 1000 / p.target.side_px) for p in pictures]
-    pictures.sort(key=lambda p: p.distance_m)
-    out_of_focus = [p for p in pictures if abs(p.distance_m / focus_m - 1) > _AT_FOCUS]
-    advice += _advice(pictures, out_of_focus, sharpest, focus_m)
-    if not out_of_focus:
-        raise FitError("all photographs were taken at one distance: step back, without refocusing", file=folder_name)
-
-    def colours_of(picture: Photograph, half: int) -> Array:
-        pixels = read_image(Path(folder) / picture.file).pixels[0, :3].double().numpy()
-        return np.stack([untoned(c, bend) if len(errors) else c for c in picture.target.window(pixels, half)])
-
-    def pair(blurred: Photograph) -> Capture:
-        both = sharpest, blurred
-        half = int(WINDOW * min(p.target.side_px for p in both))
-        sharp_levels, blurred_levels = (p.target.window(original[p.file], half) for p in both)
-        return Capture(
-            sharpest.target.window(sharpest.light, half),
-            blurred.target.window(blurred.light, half),
-            blurred.distance_m,
-            files=(str(Path(folder) / sharpest.file), str(Path(folder) / blurred.file)),
-            white=1.0 if sharpest.clipped else None,
-            colours=(colours_of(sharpest, half), colours_of(blurred, half)) if colours == "each" else None,
-            uncertain=tuple((untoned(sharp_levels, b), untoned(blurred_levels, b)) for b in bend + errors),
-        )
-
-    notes = {"target_square_mm": square_mm, "pictures": [p.file for p in pictures], "sharp": sharpest.file}
-    notes |= {"tone_curve": bend.tolist(), "from_exif": list(CAMERA)}
-    camera, name = {name: settings[name] for name in CAMERA}, Path(folder).resolve().name
-    captures = Captures(tuple(map(pair, out_of_focus)), focus_m, width, **camera, name=name, notes=notes)
-    return Photographs(captures, tuple(pictures), tuple(advice))
+    placed = [replace(p, distance_m=image_px * square_mm / 1000 / p.target.side_px) for p in pictures]
+    return sorted(placed, key=lambda p: p.distance_m), sharpest, focus_m
 
 
 def _advice(

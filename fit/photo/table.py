@@ -103,14 +103,54 @@ def fit_captures(
     if not isinstance(captures, Captures):
         raise FitError(f"captures must be a Captures(pairs, focus_m=..., width_px=...), got {show(captures)}")
     checked(choice, "family", family, ("auto", *SHAPES))
-    focus, pairs, has_first_fits, done = captures.focus_m, captures.pairs, family in ("auto", *OPENINGS), count(1)
+    pairs, done = captures.pairs, count(1)
+    total = len(pairs) * (2 if family in ("auto", *OPENINGS) else 1)
 
     def report(pair: Capture) -> None:
         if progress:
-            progress(next(done), len(pairs) * (2 if has_first_fits else 1), f"{pair.distance_m:g} m")
+            progress(next(done), total, f"{pair.distance_m:g} m")
 
-    why, opening, first_fits = f"family {family!r} was asked for", None, list[BlurFit]()
-    for pair in pairs if has_first_fits else ():  # each alone determines the family or the opening; the final fits warn
+    family, why, opening = _chosen(captures, family, accuracy_db, report)
+    fits = _fits(captures, family, opening, report)
+    radius_px = np.array([f.radius for f in fits])
+    check_agreement(captures, radius_px)
+    coc_px, scale = _coc_px(captures, radius_px, scale_of)
+    if len(pairs) == 1:
+        text = f"one distance was measured ({pairs[0].distance_m:g} m); the thin lens scales it to all others"
+        warn(text, "single distance", pairs[0].files[1])
+    params, colours = _params(fits, family), dict[str, tuple[BlurFit, ...]]()
+    if all(pair.colours is not None for pair in pairs):
+        by_pair = [_fit_colours(pair, captures.focus_m, fit) for pair, fit in zip(pairs, fits, strict=True)]
+        colours = dict(zip(("red", "green", "blue"), zip(*by_pair, strict=True), strict=True))
+        colour_params = [_params(colour_fits, family) for colour_fits in colours.values()]
+        params = {n: np.stack([p[n] for p in colour_params]) for n in params}
+    sensor = captures.sensor_width_mm
+    unit = captures.width_px if sensor is None else captures.width_px / sensor
+    made = {"coc_from": scale, "family_because": why, "command": command}
+    table = BlurTable(
+        family if opening is None else "disc",
+        (coc_px / unit).tolist(),
+        {k: (v / unit if k in LENGTHS else v).tolist() for k, v in params.items()},
+        unit="fraction" if sensor is None else "mm",
+        sensor_width_mm=sensor,
+        name=captures.name,
+        provenance=_provenance(captures, fits) | made | ({"colours": list(colours)} if colours else {}),
+        residual=[round(f.residual, 6) for f in fits],
+        aperture=opening,
+    )
+    return TableFit(table, tuple(fits), tuple(coc_px.tolist()), why, scale, colours)
+
+
+Report = Callable[[Capture], None]
+
+
+def _chosen(captures: Captures, family: str, accuracy_db: float, report: Report) -> tuple[str, str, Aperture | None]:
+    """The family for all distances, why it was chosen, and the opening as seen from behind the focus, if it has one."""
+    why = f"family {family!r} was asked for"
+    if family not in ("auto", *OPENINGS):
+        return family, why, None
+    focus, pairs, first_fits = captures.focus_m, captures.pairs, list[BlurFit]()
+    for pair in pairs:  # each alone determines the family or the opening; the final fits warn
         with without_warnings():
             first_fits.append(_fit_one(pair, focus, family, accuracy_db=accuracy_db))
         report(pair)
@@ -119,13 +159,22 @@ def fit_captures(
         richest = max(range(len(pairs)), key=lambda i: _BY_COST.index(first_fits[i].family))
         family = first_fits[richest].family
         why = f"{family}, for {pairs[richest].distance_m:g} m: {first_fits[richest].why}"
-    if family in OPENINGS:  # that of the largest blur, as seen behind the focus
-        openings = [(fit, pair) for fit, pair in zip(first_fits, pairs, strict=True) if fit.family == family]
-        largest, pair = max(openings, key=lambda one: one[0].radius)
-        opening = _seen(largest.aperture or Aperture(), pair, focus)
-    fit_of, larger = dict[int, BlurFit](), dict[bool, BlurFit]()  # larger: the next larger blur on each side of focus
+    if family not in OPENINGS:
+        return family, why, None
+    openings = [(fit, pair) for fit, pair in zip(first_fits, pairs, strict=True) if fit.family == family]
+    largest, pair = max(openings, key=lambda one: one[0].radius)
+    return family, why, _seen(largest.aperture or Aperture(), pair, focus)
+
+
+def _fits(captures: Captures, family: str, opening: Aperture | None, report: Report) -> list[BlurFit]:
+    """The fit of each distance, from the largest blur to the smallest: each expects the shape of the one before."""
+    focus, fit_of, larger = (
+        captures.focus_m,
+        dict[int, BlurFit](),
+        dict[bool, BlurFit](),
+    )  # larger: on each side of focus
     for i in np.argsort(-np.abs(captures.defocus)).tolist():
-        pair, side = pairs[i], bool(captures.defocus[i] > 0)
+        pair, side = captures.pairs[i], bool(captures.defocus[i] > 0)
         aperture = None if opening is None else _seen(opening, pair, focus)
         name = family if aperture is None else "image"
         fit = _fit_one(pair, focus, name, aperture=aperture, like=larger.get(side))
@@ -136,48 +185,29 @@ def fit_captures(
             warn(text, "exposure", pair.files[1])
         fit_of[i] = larger[side] = _with_uncertainty(pair, focus, fit)
         report(pair)
-    fits = [fit_of[i] for i in range(len(pairs))]
-    radius_px = np.array([f.radius for f in fits])
-    check_agreement(captures, radius_px)
-    coc_px, defocus, scale = captures.promised_px, captures.defocus, "camera"
-    if coc_px is None and scale_of is not None:
-        coc_px, scale = np.array(scale_of.coc_px), scale_of.scale
-    elif coc_px is None:
-        coc_px, scale = float(np.abs(defocus) @ radius_px / (defocus @ defocus)) * defocus, "measured"
-    if len(pairs) == 1:
-        text = f"one distance was measured ({pairs[0].distance_m:g} m); the thin lens scales it to all others"
-        warn(text, "single distance", pairs[0].files[1])
-    params = _params(fits, family)
-    provenance = {
-        **{"source": "photographs of a dot", "date": datetime.date.today().isoformat(), "focus_m": focus},
+    return [fit_of[i] for i in range(len(captures.pairs))]
+
+
+def _coc_px(captures: Captures, radius_px: Array, scale_of: TableFit | None) -> tuple[Array, str]:
+    """Signed circles of confusion of the distances, and where their scale comes from."""
+    if captures.promised_px is not None:
+        return captures.promised_px, "camera"
+    if scale_of is not None:
+        return np.array(scale_of.coc_px), scale_of.scale
+    defocus = captures.defocus
+    return float(np.abs(defocus) @ radius_px / (defocus @ defocus)) * defocus, "measured"
+
+
+def _provenance(captures: Captures, fits: Sequence[BlurFit]) -> dict[str, Any]:
+    """What the table records of the photographs and their fits."""
+    return {
+        **{"source": "photographs of a dot", "date": datetime.date.today().isoformat(), "focus_m": captures.focus_m},
         **{"distances_m": captures.distances_m.tolist(), "width_px": captures.width_px},
         "residual_over_noise": [round(f.residual_over_noise, 3) for f in fits if math.isfinite(f.residual_over_noise)],
         "asymmetry": [round(f.asymmetry, 4) for f in fits],
         **captures.notes,
         **{name: getattr(captures, name) for name in CAMERA if getattr(captures, name) is not None},
-        **{"coc_from": scale, "family_because": why, "command": command},
     }
-    colours: dict[str, tuple[BlurFit, ...]] = {}
-    if all(pair.colours is not None for pair in pairs):
-        by_pair = [_fit_colours(pair, focus, fit) for pair, fit in zip(pairs, fits, strict=True)]
-        colours = dict(zip(("red", "green", "blue"), zip(*by_pair, strict=True), strict=True))
-        colour_params = [_params(colour_fits, family) for colour_fits in colours.values()]
-        params = {n: np.stack([p[n] for p in colour_params]) for n in params}
-        provenance["colours"] = list(colours)
-    sensor = captures.sensor_width_mm
-    unit = captures.width_px if sensor is None else captures.width_px / sensor
-    table = BlurTable(
-        family if opening is None else "disc",
-        (coc_px / unit).tolist(),
-        {k: (v / unit if k in LENGTHS else v).tolist() for k, v in params.items()},
-        unit="fraction" if sensor is None else "mm",
-        sensor_width_mm=sensor,
-        name=captures.name,
-        provenance=provenance,
-        residual=[round(f.residual, 6) for f in fits],
-        aperture=opening,
-    )
-    return TableFit(table, tuple(fits), tuple(coc_px.tolist()), why, scale, colours)
 
 
 def check_agreement(captures: Captures, radius_px: Sequence[float] | Array) -> None:
