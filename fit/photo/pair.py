@@ -1,7 +1,7 @@
 """Fits one kernel to a pair of pictures, sharp and defocused."""
 
 from dataclasses import replace
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,7 +15,7 @@ from ..result import Array, BlurFit
 from .diagnostics import EXPLAINED, FAR_ABOVE, bic_of, check_fit, check_focus, check_levels, check_linearity, describe
 from .dot import check_blacks, find_dot, fine_share_inside, independent_share, used_pixels
 from .family_choice import COST, choose, looks_alike
-from .forward import ALL_MOVES, OPENINGS, SHAPES, Forward
+from .forward import ALL_MOVES, OPENINGS, SHAPES, Forward, Solution
 from .free_kernels import solve_image, solve_opening, solve_polygon, solve_radial
 from .profile_fit import blur_strength, fit_profile
 from .source import Edge, ideal_dot, picture_of_dot, point_source, soft_edge
@@ -100,22 +100,7 @@ def fit_pair(
         >>> fit.family, round(fit.params["radius"], 3)
         ('disc', 8.0)
     """
-    checked(choice, "family", family, ("auto", *SHAPES))
-    checked(choice, "model", model, get_args(Model))
-    checked(choice, "source", source, get_args(SourceKind))
-    checked(number, "accuracy_db", accuracy_db, unit="dB")
-    checked(number, "magnification", magnification, 1e-3, 1e3)  # a larger ratio makes one dot invisible
-    for name, value, least in (("white", white, -1e100), ("reach", reach, 0), ("softness", softness, -1e-9)):
-        if value is not None:
-            checked(number, name, value, least, 1e100)
-    if knots is not None:
-        checked(whole, "knots", knots, 2, 1000)
-    if fit_magnification is not None and not isinstance(fit_magnification, bool):
-        raise FitError(f"fit_magnification must be True, False or None, got {show(fit_magnification)}")
-    if aperture is not None and (not isinstance(aperture, Aperture) or family != "image"):
-        raise FitError(f"aperture must be an Aperture, and goes with family='image', got {show(aperture)}")
-    if like is not None and not isinstance(like, BlurFit):
-        raise FitError(f"like must be a BlurFit, the result of a fit, got {show(like)}")
+    _refuse(**locals())
     data = a_picture("blurred", blurred, _MIN_WINDOW_PX, files[1])
     sharp_picture = None if sharp is None else a_picture("sharp", sharp, _MIN_WINDOW_PX, files[0])
     if sharp_picture is not None and sharp_picture.shape != data.shape:
@@ -141,23 +126,11 @@ def fit_pair(
         if sharp is not None and fit_magnification is None:
             free_pair = replace(pair, fit_moves=ALL_MOVES)
             free = solve_radial(free_pair, solution.moves, end, knots) if free_profile else free_pair.solve(family)
-            # scale of chi squared: the residual or, without noise, a spline's rounding; correlated noise counts less
-            squares, free_squares = (float(one.residual @ one.residual) for one in (solution, free))
-            scale = max(free_squares / pair.values.size, (1e-4 * pair.unit) ** 2)
-            if (squares - free_squares) / scale * independent_share(pair.noise_correlation) > _MIN_CHI_GAIN:
+            if _contradicts(pair, solution, free):
                 pair, freest, solution = free_pair, free, free
         why, opening, pair.held_magnification = "", None, freest.moves["magnification"]
         if free_profile and family == "auto":
-            # every family at the free profile's magnification; the chosen one is then fitted with it
-            held_pair = replace(pair, fit_moves=("dx", "dy"))
-            solutions = {"radial": freest} | {f: held_pair.solve(f) for f in COST[:-1]}
-            kernels, bic = {f: s.kernel for f, s in solutions.items()}, {f: bic_of(s) for f, s in solutions.items()}
-            chosen, why = choose(kernels, bic, accuracy_db)
-            is_final = chosen == "radial" or pair.fit_moves != ALL_MOVES
-            solution = solutions[chosen] if is_final else pair.solve(chosen)
-            opening = solve_opening(freest)
-            if opening is not None and looks_alike(solution.kernel, opening[0].kernel, accuracy_db):
-                opening = None
+            solution, why, opening = _cheapest(pair, freest, accuracy_db)
         elif free_profile and family in OPENINGS:
             opening = (solve_polygon if family == "polygon" else solve_image)(freest), ""
         if opening is not None:
@@ -175,6 +148,62 @@ def fit_pair(
                 check_levels(freest, expected, edge, files[1])
             check_focus(edge, fit.radius, pair.source.ideal, files[0])
     return fit
+
+
+def _refuse(
+    family: str,
+    model: Model,
+    accuracy_db: float,
+    source: SourceKind,
+    magnification: float,
+    fit_magnification: bool | None,
+    knots: int | None,
+    aperture: Aperture | None,
+    like: BlurFit | None,
+    **others: Any,
+) -> None:
+    """Refuses arguments of :func:`fit_pair` other than the pictures."""
+    checked(choice, "family", family, ("auto", *SHAPES))
+    checked(choice, "model", model, get_args(Model))
+    checked(choice, "source", source, get_args(SourceKind))
+    checked(number, "accuracy_db", accuracy_db, unit="dB")
+    checked(number, "magnification", magnification, 1e-3, 1e3)  # a larger ratio makes one dot invisible
+    for name, least in (("white", -1e100), ("reach", 0), ("softness", -1e-9)):
+        if others[name] is not None:
+            checked(number, name, others[name], least, 1e100)
+    if knots is not None:
+        checked(whole, "knots", knots, 2, 1000)
+    if fit_magnification is not None and not isinstance(fit_magnification, bool):
+        raise FitError(f"fit_magnification must be True, False or None, got {show(fit_magnification)}")
+    if aperture is not None and (not isinstance(aperture, Aperture) or family != "image"):
+        raise FitError(f"aperture must be an Aperture, and goes with family='image', got {show(aperture)}")
+    if like is not None and not isinstance(like, BlurFit):
+        raise FitError(f"like must be a BlurFit, the result of a fit, got {show(like)}")
+
+
+def _contradicts(pair: Forward, held: Solution, free: Solution) -> bool:
+    """Whether the pictures contradict the expected magnification: a free one explains them significantly better."""
+    # scale of chi squared: the residual or, without noise, a spline's rounding; correlated noise counts less
+    squares, free_squares = (float(one.residual @ one.residual) for one in (held, free))
+    scale = max(free_squares / pair.values.size, (1e-4 * pair.unit) ** 2)
+    return (squares - free_squares) / scale * independent_share(pair.noise_correlation) > _MIN_CHI_GAIN
+
+
+def _cheapest(pair: Forward, freest: Solution, accuracy_db: float) -> tuple[Solution, str, tuple[Solution, str] | None]:
+    """The cheapest family that is accurate enough, why, and an opening that explains more than that, if there is one.
+
+    Every family is fitted at the free profile's magnification; the chosen one is then fitted with it.
+    """
+    held_pair = replace(pair, fit_moves=("dx", "dy"))
+    solutions = {"radial": freest} | {f: held_pair.solve(f) for f in COST[:-1]}
+    kernels, bic = {f: s.kernel for f, s in solutions.items()}, {f: bic_of(s) for f, s in solutions.items()}
+    chosen, why = choose(kernels, bic, accuracy_db)
+    is_final = chosen == "radial" or pair.fit_moves != ALL_MOVES
+    solution = solutions[chosen] if is_final else pair.solve(chosen)
+    opening = solve_opening(freest)
+    if opening is not None and looks_alike(solution.kernel, opening[0].kernel, accuracy_db):
+        opening = None
+    return solution, why, opening
 
 
 def prepared_pair(
