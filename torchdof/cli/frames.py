@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from .render import Render
 
 _MOST_FRAMES = 1_000_000  # of one run; a larger number is a slip of the finger, and would not fit into memory
-_LAYERS = "--keep-layers is for an EXR that is written to an EXR"
 _ARRAYS = (".npy", ".npz")  # files that may hold the maps of all frames
 
 
@@ -38,12 +37,9 @@ class Frames:
         no_number = f"{command.out}: expected one place for the frame number, such as pull.##.png; ffmpeg joins frames"
         of_single = f"{command.matte}: masks of frames are for a sequence; IMAGE is a single image"
         are_exr = {command.image.suffix.lower(), command.out.suffix.lower()} == {".exr"}
-        no_metres = command.steady and command.depth_kind == "coc"
+        no_metres, other_types = command.steady and command.depth_kind == "coc", command.keep_layers and not are_exr
         refuse(
-            (
-                command.keep_layers and not are_exr,
-                "--keep-layers is for an EXR that is written to an EXR; leave it out",
-            ),
+            (other_types, "--keep-layers is for an EXR that is written to an EXR; leave it out"),
             (not is_single and not out, no_number),
             (command.sheet and not is_single, "--sheet is of one picture; leave it out where there are more"),
             (frames.mattes and not images, of_single),

@@ -1,4 +1,4 @@
-// The split of a pixel at an edge: steps 1 to 5 of matte in torchdof/render/surfaces/matting.py.
+// The split of a pixel at an edge: steps 1 and 2 of matte in torchdof/render/surfaces/matting.py; mixed_pixel.h has the others.
 #pragma once
 #include "matting.h"
 
@@ -26,9 +26,9 @@ struct Split {
   float total_nearer, total_farther;  // sums of the weights
   Colours clean, seen;                // of the clean light, and of the light without that of the other surface
   float per_strength;                 // of the contrast of the clean colours
-  float per_counted;  // of the small Gaussian under which the near surface covers the pixel
+  float per_counted;                  // of the small Gaussian under which the near surface covers the pixel
   torchdof::MixedPixel<float, CHANNELS> mixed;
-  float own_light[CHANNELS];
+  float own_light[CHANNELS];          // of the pixel
 
   __device__ float light(const Run &r, const Pixel &q, int c) const { return light_of(r, q, c) * per_scale; }
   __device__ Neighbour neighbour(const Run &r, const Pixel &p, int i) const {
