@@ -21,7 +21,8 @@ from torch import Tensor
 
 _CONSTANTS = ("composite", "disocclusion", "doubt", "frame", "layer_weights", "matting")
 HEADERS = (
-    *("frame.h", "weights.h", "matting.h", "split.h", "mixed_pixel.h", "rules.h", "numbers.h"),
+    *("frame.h", "weights.h", "matting.h", "split.h"),
+    *("mixed_pixel.h", "mixture.h", "rules.h", "numbers.h"),
     *(f"constants/{name}.h" for name in _CONSTANTS),
 )
 """Files beside this one that kernels include; the build installs those that the compiled engine includes too."""

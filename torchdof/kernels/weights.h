@@ -1,6 +1,7 @@
 // The weights of a pixel's surfaces in a layer, and the stand-ins for its background; with their gradients.
 #pragma once
 #include "frame.h"
+#include "mixture.h"
 #include "rules.h"
 
 using namespace torchdof;
@@ -67,41 +68,25 @@ __device__ inline void weigh_back(const Ramps &l, const Pixel &p, const Weights 
   }
 }
 #else
-// One surface, or two that share a pixel; the formula of _mixed in render/surfaces/frame.py. Of surface j: its share a at or behind the
-// layer, and b behind it; c, the weight that counts, w + continuation(w) visible_part(a of the nearer surface).
-struct Mixture {
-  float a[SURFACES], b[SURFACES], c[SURFACES];
-};
-__device__ inline Mixture mixture_of(const Ramps &l, const Pixel &p) {
-  Mixture t;
-  for (int j = 0; j < SURFACES; j++) {
-    t.a[j] = ramp(l.at_or_behind(p.place[j]), true);
-    t.b[j] = ramp(l.behind(p.place[j]), true);
-    t.c[j] = p.weight[j] + (j ? continuation(p.weight[j]) * visible_part(t.a[0]) : 0.0f);
-  }
-  return t;
+// One surface, or two that share a pixel.
+__device__ inline Mixture<float, SURFACES> mixture_of(const Ramps &l, const Pixel &p) {
+  Mixture<float, SURFACES> m;
+  m.eased = true;
+  for (int j = 0; j < SURFACES; j++) m.weight[j] = p.weight[j], m.ahead[j] = l.at_or_behind(p.place[j]), m.here[j] = l.behind(p.place[j]);
+  m.weigh();
+  return m;
 }
 __device__ inline Weights weigh(const Ramps &l, const Pixel &p) {
-  const Mixture t = mixture_of(l, p);
-  Weights w = {};
-  for (int j = 0; j < SURFACES; j++) {
-    w.own[j] = (t.a[j] - t.b[j]) * t.c[j];
-    w.beyond += t.b[j] * t.c[j];
-  }
+  const Mixture<float, SURFACES> m = mixture_of(l, p);
+  Weights w = {{}, m.beyond()};
+  for (int j = 0; j < SURFACES; j++) w.own[j] = m.own(j);
   return w;
 }
 // Adds the gradients by places and weights.
 __device__ inline void weigh_back(const Ramps &l, const Pixel &p, const Weights &of, float *of_place, float *of_weight) {
-  const Mixture t = mixture_of(l, p);
-  float of_nearer = 0;
-  for (int j = SURFACES - 1; j >= 0; j--) {
-    const float of_c = of.own[j] * (t.a[j] - t.b[j]) + of.beyond * t.b[j];
-    const float of_a = of.own[j] * t.c[j] + (j ? 0.0f : of_nearer), of_b = (of.beyond - of.own[j]) * t.c[j];
-    if (j) of_nearer += of_c * continuation(p.weight[j]) * slope_of_visible_part(t.a[0]);
-    of_weight[j] += of_c * (j ? 1 + slope_of_continuation(p.weight[j]) * visible_part(t.a[0]) : 1.0f);
-    of_place[j] += of_a * slope_of_ramp(l.at_or_behind(p.place[j]), true) / l.width;
-    of_place[j] += of_b * slope_of_ramp(l.behind(p.place[j]), true) / l.next_width;
-  }
+  float of_ahead[SURFACES], of_here[SURFACES], of_share[SURFACES];
+  mixture_of(l, p).back(of.own, of.beyond, of_ahead, of_here, of_share);
+  for (int j = 0; j < SURFACES; j++) of_place[j] += of_ahead[j] / l.width + of_here[j] / l.next_width, of_weight[j] += of_share[j];
 }
 #endif
 

@@ -25,6 +25,7 @@
 #include "entry.h"
 #include "layers.h"
 #include "memory.h"
+#include "mixture.h"
 #include "rules.h"
 #include "simd.h"
 #include "threads.h"
@@ -356,37 +357,33 @@ class Blend {
   }
 
   // The surfaces of some pixels, near to far, in a layer.
-  struct Pixels {
-    vec weight[2], counted[2];        // given; with the continuation of the farther surface
-    vec ahead[2], here[2];            // arguments of the ramps
-    vec h[2], t[2];                   // share at or behind the layer; share behind it
-    vec extra = {};                   // weight of the continuation
+  template <int S>
+  struct Pixels : Mixture<vec, S> {
     decltype(vec{} < vec{}) swapped;  // the frame's second surface is the nearer one
+
+    // Surface j of the frame from the nearer and the farther one, or the other way round.
+    vec swap(const vec *surfaces, int j) const {
+      return S > 1 ? (swapped ? surfaces[S - 1 - j] : surfaces[j]) : surfaces[j];
+    }
   };
-  // Surface j of the frame from the nearer and the farther one, or the other way round.
   template <int S>
-  static vec swap(const Pixels &p, const vec *surfaces, int j) {
-    return S > 1 ? (p.swapped ? surfaces[1 - j] : surfaces[j]) : surfaces[j];
-  }
-  template <int S>
-  void weigh(const Layer &l, size_t at, int n, Pixels &p) const {
-    vec place[2], weight[2];
+  Pixels<S> weigh(const Layer &l, size_t at, int n) const {
+    Pixels<S> p;
+    vec place[S], weight[S];
     for (int j = 0; j < S; j++) {
       place[j] = load_some(scene_.place[j] + at, n);
       weight[j] = weight_at(j, at, n);
     }
-    p.swapped = S > 1 ? place[1] < place[0] : place[0] < place[0];
+    p.swapped = place[S - 1] < place[0];
+    p.eased = over_;
     for (int j = 0; j < S; j++) {
-      const vec its_place = swap<S>(p, place, j);
-      p.weight[j] = p.counted[j] = swap<S>(p, weight, j);
+      const vec its_place = p.swap(place, j);
+      p.weight[j] = p.swap(weight, j);
       p.ahead[j] = unlimited_at_or_behind(l, its_place);
       p.here[j] = unlimited_behind(l, its_place);
-      p.h[j] = ramp(p.ahead[j], over_);
-      p.t[j] = ramp(p.here[j], over_);
     }
-    if (S < 2) return;
-    p.extra = continuation(p.weight[1]);
-    p.counted[1] += p.extra * visible_part(p.h[0]);
+    p.weigh();
+    return p;
   }
 
   // Calls body(y, x, n, side, occupied) for up to LANES pixels of the padded frame at a time, for those cells of a
@@ -432,19 +429,17 @@ class Blend {
         for (int j = 0; j < S; j++) behind += weight_at(j, at, n);
         return put(C + 1, behind);
       }
-      Pixels p;
-      weigh<S>(l, at, n, p);
-      for (int j = 0; j < S; j++) behind += p.t[j] * p.counted[j];
-      if (over_) put(C + 1, behind);
+      const Pixels<S> p = weigh<S>(l, at, n);
+      if (over_) put(C + 1, p.beyond());
       if (!occupied) return;
-      vec share[2], given[2];
-      for (int j = 0; j < S; j++) share[j] = (p.h[j] - p.t[j]) * p.counted[j];
-      for (int j = 0; j < S; j++) given[j] = swap<S>(p, share, j);
+      vec share[S], given[S];
+      for (int j = 0; j < S; j++) share[j] = p.own(j);
+      for (int j = 0; j < S; j++) given[j] = p.swap(share, j);
       for (int c = 0; c < C; c++) {
         const vec own = load_some(scene_.light[0] + c * map_ + at, n) * given[0];
-        put(c, S > 1 ? own + load_some(scene_.light[1] + c * map_ + at, n) * given[1] : own);
+        put(c, S > 1 ? own + load_some(scene_.light[S - 1] + c * map_ + at, n) * given[S - 1] : own);
       }
-      put(C, S > 1 ? share[0] + share[1] : share[0]);
+      put(C, S > 1 ? share[0] + share[S - 1] : share[0]);
     });
   }
 
@@ -931,14 +926,12 @@ class Blend {
           if (scene_.weight[j]) add_some(weight_[j] + at, d_behind, n);
         return;
       }
-      Pixels p;
-      weigh<S>(l, at, n, p);
-      vec d_counted[2], d_h[2] = {}, d_t[2] = {};
-      for (int j = 0; j < S; j++) d_counted[j] = d_behind * p.t[j];
+      const Pixels<S> p = weigh<S>(l, at, n);
+      vec d_share[S] = {}, d_ahead[S], d_here[S], d_place[S], d_weight[S];
       if (occupied) {
-        vec share[2], given[2], more[2] = {};
-        for (int j = 0; j < S; j++) share[j] = (p.h[j] - p.t[j]) * p.counted[j];
-        for (int j = 0; j < S; j++) given[j] = swap<S>(p, share, j);
+        vec share[S], given[S], more[S] = {};
+        for (int j = 0; j < S; j++) share[j] = p.own(j);
+        for (int j = 0; j < S; j++) given[j] = p.swap(share, j);
         for (int c = 0; c < C; c++) {
           const vec d_light = slope(c);
           for (int j = 0; j < S; j++) {
@@ -946,24 +939,13 @@ class Blend {
             add_some(light_[j] + c * map_ + at, d_light * given[j], n);
           }
         }
-        for (int j = 0; j < S; j++) {
-          const vec d_share = slope(C) + swap<S>(p, more, j);
-          d_counted[j] += d_share * (p.h[j] - p.t[j]);
-          d_h[j] = d_share * p.counted[j];
-          d_t[j] = (d_behind - d_share) * p.counted[j];
-        }
+        for (int j = 0; j < S; j++) d_share[j] = slope(C) + p.swap(more, j);
       }
-      if (S > 1) {
-        d_h[0] += d_counted[1] * p.extra * slope_of_visible_part(p.h[0]);
-        d_counted[1] *= 1.0f + slope_of_continuation(p.weight[1]) * visible_part(p.h[0]);
-      }
-      vec d_place[2];
-      for (int j = 0; j < S; j++)
-        d_place[j] = d_h[j] * slope_of_ramp(p.ahead[j], over_) * l.per_before +
-                     d_t[j] * slope_of_ramp(p.here[j], over_) * l.per_after;
+      p.back(d_share, d_behind, d_ahead, d_here, d_weight);
+      for (int j = 0; j < S; j++) d_place[j] = d_ahead[j] * l.per_before + d_here[j] * l.per_after;
       for (int j = 0; j < S; j++) {
-        add_some(place_[j] + at, swap<S>(p, d_place, j), n);
-        if (scene_.weight[j]) add_some(weight_[j] + at, swap<S>(p, d_counted, j), n);
+        add_some(place_[j] + at, p.swap(d_place, j), n);
+        if (scene_.weight[j]) add_some(weight_[j] + at, p.swap(d_weight, j), n);
       }
     });
   }
