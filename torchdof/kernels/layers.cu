@@ -232,7 +232,7 @@ extern "C" __global__ void stand_ins(const __grid_constant__ Run r) {
   if (y >= r.height || x >= r.width) return;
   const int at = (y + r.margin) * r.frame_columns + x + r.margin;
   const Pixel p = pixel_of(r, item, at);
-  const StandIns t = stand_ins_of(p);
+  const auto t = stand_ins_of(p);
   for (int n = 0; n < PLANES; n++) {
     float light = n < CHANNELS || r.backed ? 0.0f : t.sum;
     for (int j = 0; j < SURFACES && n < CHANNELS; j++) light += light_of(r, p, j, light_at(r, item, n, at)) * t.cover[j];
@@ -244,7 +244,7 @@ extern "C" __global__ void stand_ins_back(const __grid_constant__ Run r) {
   if (y >= r.height || x >= r.width) return;
   const int at = (y + r.margin) * r.frame_columns + x + r.margin;
   const Pixel p = pixel_of(r, item, at);
-  const StandIns t = stand_ins_of(p);
+  const auto t = stand_ins_of(p);
   float of_cover[SURFACES] = {}, of_place[SURFACES] = {}, of_weight[SURFACES] = {};
   for (int n = 0; n < PLANES; n++) {
     float &g = r.of_after[((long long)item * PLANES + n) * area_of_canvas(r) + here];
@@ -256,19 +256,7 @@ extern "C" __global__ void stand_ins_back(const __grid_constant__ Run r) {
     }
     g *= 1 - t.sum;
   }
-  for (int j = 0; j < SURFACES; j++) {
-    const float of_part = of_cover[j] * t.alone[j] * t.left[j];
-    of_weight[j] += of_part * slope_of_seen(p.weight[j]) * t.at_place[j];
-    of_place[j] += of_part * t.seen_part[j] * slope_of_stands_in(p.place[j]);
-    const float of_alone = of_cover[j] * t.seen_part[j] * t.at_place[j] * t.left[j];
-    for (int i = 0; i < SURFACES; i++) {
-      if (i == j) continue;
-      const float of_taken = -of_alone * left_by(t.taken, SURFACES, i, j);
-      of_weight[i] += of_taken * slope_of_counts(p.weight[i]) * at_focus(p.place[i]);
-      of_place[i] += of_taken * counts(p.weight[i]) * slope_of_at_focus(p.place[i]);
-      if (STACKED && i < j) of_weight[i] -= of_cover[j] * t.seen_part[j] * t.at_place[j] * t.alone[j] * left_by(p.weight, j, i);
-    }
-  }
+  t.back(of_cover, of_place, of_weight);
   add_to(r, item, at, p, of_place, of_weight);
 }
 

@@ -11,14 +11,6 @@ struct Weights {
   float own[SURFACES], beyond;
 };
 
-// The product of 1 - values[i] for i < count, without one or two of them.
-__device__ inline float left_by(const float *values, int count, int without, int and_without = -1) {
-  float left = 1;
-  for (int i = 0; i < count; i++)
-    if (i != without && i != and_without) left *= 1 - values[i];
-  return left;
-}
-
 #if STACKED
 // Surfaces that cover a pixel independently, near to far; the formula of _stacked in render/surfaces/frame.py. Of surface j: its
 // share a at or behind the layer, and b behind it; h, the part of the light from behind that the surface hides in this layer and
@@ -90,22 +82,10 @@ __device__ inline void weigh_back(const Ramps &l, const Pixel &p, const Weights 
 }
 #endif
 
-// Stand-ins for the background (PaddedFrame.stand_ins in render/surfaces/frame.py): the cover of each surface of a pixel, its
-// factors, and their sum. taken: how far a surface at the focus takes the place of a stand-in.
-struct StandIns {
-  float seen_part[SURFACES], at_place[SURFACES], taken[SURFACES], alone[SURFACES], left[SURFACES], cover[SURFACES], sum;
-};
-__device__ inline StandIns stand_ins_of(const Pixel &p) {
-  StandIns t;
-  t.sum = 0;
-  for (int j = 0; j < SURFACES; j++) t.taken[j] = counts(p.weight[j]) * at_focus(p.place[j]);
-  for (int j = 0; j < SURFACES; j++) {
-    t.seen_part[j] = seen(p.weight[j]);
-    t.at_place[j] = stands_in(p.place[j]);
-    t.alone[j] = left_by(t.taken, SURFACES, j);
-    t.left[j] = STACKED ? left_by(p.weight, j, -1) : 1.0f;  // what nearer surfaces leave
-    t.cover[j] = t.seen_part[j] * t.at_place[j] * t.alone[j] * t.left[j];
-    t.sum += t.cover[j];
-  }
+// The surfaces of a pixel as stand-ins for its background.
+__device__ inline StandIns<float, SURFACES, STACKED> stand_ins_of(const Pixel &p) {
+  StandIns<float, SURFACES, STACKED> t;
+  for (int j = 0; j < SURFACES; j++) t.place[j] = p.place[j], t.weight[j] = p.weight[j];
+  t.find();
   return t;
 }

@@ -583,25 +583,14 @@ class Blend {
     return true;
   }
 
-  // The surfaces of some pixels as stand-ins.
-  struct StandIns {
-    vec place[2], weight[2], missing[2], cover[2];  // missing: 1 where the surface takes no stand-in's place
-    vec sum = {};                                   // of covers
-  };
+  // The surfaces of some pixels as stand-ins; a second one that is not there has no weight.
+  using StandIns = torchdof::StandIns<vec, 2, false>;
   StandIns stand_ins(size_t at, int n) const {
-    StandIns s;
-    for (int j = 0; j < S_; j++) {
-      s.place[j] = load_some(scene_.place[j] + at, n);
-      s.weight[j] = weight_at(j, at, n);
-      s.missing[j] = 1.0f - counts(s.weight[j]) * at_focus(s.place[j]);
-    }
-    for (int j = 0; j < S_; j++) {
-      s.cover[j] = seen(s.weight[j]) * stands_in(s.place[j]) * alone(s, j);
-      s.sum += s.cover[j];
-    }
+    StandIns s = {};
+    for (int j = 0; j < S_; j++) s.place[j] = load_some(scene_.place[j] + at, n), s.weight[j] = weight_at(j, at, n);
+    s.find();
     return s;
   }
-  vec alone(const StandIns &s, int j) const { return S_ > 1 ? s.missing[1 - j] : broadcast(1.0f); }
   // Calls body(i, at, n, stand_ins) for up to LANES pixels at a time, i in a block of the picture and `at` in the
   // padded frame, where any surface stands in.
   template <typename Body>
@@ -641,15 +630,8 @@ class Blend {
             add_some(light_[j] + c * map_ + at, slope * s.cover[j], n);
           }
         });
-      for (int j = 0; j < S_; j++) {
-        d_cover[j] += scene_.backed ? -d_sum : d_sum;
-        d_weight[j] += d_cover[j] * slope_of_seen(s.weight[j]) * stands_in(s.place[j]) * alone(s, j);
-        d_place[j] += d_cover[j] * seen(s.weight[j]) * slope_of_stands_in(s.place[j]) * alone(s, j);
-        if (S_ == 1) continue;
-        const vec d_missing = d_cover[j] * seen(s.weight[j]) * stands_in(s.place[j]);
-        d_weight[1 - j] -= d_missing * slope_of_counts(s.weight[1 - j]) * at_focus(s.place[1 - j]);
-        d_place[1 - j] -= d_missing * counts(s.weight[1 - j]) * slope_of_at_focus(s.place[1 - j]);
-      }
+      for (vec &d : d_cover) d += scene_.backed ? -d_sum : d_sum;
+      s.back(d_cover, d_place, d_weight);
       for (int j = 0; j < S_; j++) {
         add_some(place_[j] + at, d_place[j], n);
         if (scene_.weight[j]) add_some(weight_[j] + at, d_weight[j], n);
