@@ -70,7 +70,7 @@ def uneven_scene() -> tuple[Tensor, Tensor, Tensor]:
 
 
 def test_both_surfaces_of_an_uneven_scene_have_the_recorded_coc() -> None:
-    """A change of the rules that changes what is found must record the new means here."""
+    """A change of the rules that changes these maps must record the new means here."""
     moved, covered = covered_by(*uneven_scene(), threshold)
     assert covered is not None
     means = [float(values.double().mean()) for values in (moved, covered[:, 3], covered[:, 5])]

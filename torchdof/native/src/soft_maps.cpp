@@ -68,7 +68,7 @@ class SoftMap : EdgeMap {
   // Raises the nearness of lamps of a few pixels, which a soft map averages with their surroundings.
   void lift_lamps(float sigma, float lost_px, float doubt) const {
     const std::vector<float> weights = even_window();
-    const float is_lost = clamp01(NONE_TOO_THIN + PER_LOST_PX * lost_px) * (1.0f - doubt);
+    const float is_lost = clamp01(LOST + LOST_PER_PX * lost_px) * (1.0f - doubt);
     const std::vector<Group> all_parts = tiles();
     const int reach = blur_reach(sigma);
     parallel((int)all_parts.size(), [&](int g) {

@@ -36,7 +36,7 @@ _TRUST = 10.0  # weight of variance against contrast; larger: texture stops more
 _TEXTURE = 50.0  # weight of variance against contrast; larger: texture keeps more of a neighbour's mixed light
 _MOST_CLEAN = 4.0  # upper limit for a neighbour's clean light, as a multiple of the brightest neighbour
 _SOFTNESS_PX = 0.6  # standard deviation of the Gaussian by which two surfaces mix where their colours are alike
-_SOFTNESS_FALLOFF = math.exp(-0.5 / _SOFTNESS_PX**2)  # its weight at a distance of 1 px
+_SOFTNESS_FALLOFF = math.exp(-0.5 / _SOFTNESS_PX**2)  # its weight at a distance of 1 px, read by C++ and CUDA
 _ALIKE = 1.0 / 255.0  # contrast at which trust is halved, as a fraction of the brightest light around
 _UNBOUNDED = 1e6  # upper limit for either part, as a multiple of the brightest neighbour; avoids 0 * inf
 

@@ -18,10 +18,10 @@ _CLIMBED = 0.35  # standard deviation of a ramp, as a fraction of (pixels of its
 _USUAL_REACH = 7  # px; half the width of the window of the usual light around a lamp
 _LAMP_FALLOFF_PX = 3.0  # standard deviation of the Gaussian weights of the window of a fit
 _LAMP_REACH = 2  # px; half the width of the largest lamp
-_LAMP, _GLARE = 4.0, 2.0  # light of a lamp, and of what counts to its cover, over the usual light around it
+_LAMP, _GLARE = 4.0, 2.0  # light, over the usual light around: least of a lamp; least of a pixel of its cover
 _LAMP_PEAK = 0.1  # least light of a lamp, over the brightest in its reach
 _LAMP_STEP = 0.5  # least range of nearness around it, in smallest steps
-_NONE_TOO_THIN, _PER_LOST_PX = 2.4, 2.5  # lamps are lost with near surfaces as wide as they are; for each px too thin
+_LOST, _LOST_PER_PX = 2.4, 2.5  # part of lamps that a blur removes, if near surfaces lose no width; more for each px
 _LEAST_VARIANCE = 0.004  # of a blurred cover, from which a fit counts
 _PIXEL = 0.2  # px^2; variance that the area of a pixel adds to a ramp
 _LEAST_BLUR_PX, _MOST_BLUR_PX = 0.2, 3.0  # range of the standard deviation
@@ -101,7 +101,7 @@ def lift_lamps(light: Tensor, nearness: Tensor, repaired: Tensor, step: Tensor, 
     of_lamps = pixels.put(torch.zeros_like(nearness).repeat(1, 3, 1, 1), lamp_pixels, values)
     total, level, fit = pixels.pick(of_lamps, pixels.around(lamp_pixels, nearness, _LAMP_REACH)).sum(1).unbind(0)
     level, fit = (values / total.clamp_min(1e-9) for values in (level, fit))
-    is_lost = ((_NONE_TOO_THIN + _PER_LOST_PX * soft.lost_px).clamp(0.0, 1.0) * (1.0 - soft.doubt)).flatten()
+    is_lost = ((_LOST + _LOST_PER_PX * soft.lost_px).clamp(0.0, 1.0) * (1.0 - soft.doubt)).flatten()
     fit = fit * is_lost[lamp_pixels // nearness[0].numel()]
     own = pixels.pick(repaired, lamp_pixels)[0]
     return pixels.put(repaired, lamp_pixels, own + fit * (level - own).clamp_min(0.0))
