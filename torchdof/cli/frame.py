@@ -113,7 +113,7 @@ def _stored(
 def _understood(
     scene: Scene, values: Tensor, source: Path, meaning: Mapping[str, Any], estimate: Estimate, holes: bool
 ) -> tuple[Scene, Tensor, list[str], str]:
-    """Interprets a map: the options with the guessed ones, the numbers without marks of holes, remarks, and the guess."""
+    """Interprets a map: the options with guessed ones, the numbers without marks of holes, remarks, and the guess."""
     scene, guess = scene.with_meaning(meaning) if meaning else (scene, "")
     known = values if scene.depth_unknown is None else values.masked_fill(values == scene.depth_unknown, math.nan)
     known, sentinels = without_sentinels(known)
