@@ -30,6 +30,8 @@ _MAX_EXPOSURE_RATIO = 1.3  # ratio of fitted to stated exposure above which to w
 _BY_COST = (*COST, *OPENINGS)
 _KNOTS = 33  # values of a free profile, equal for all distances
 
+Report = Callable[[Capture], None]  # called with each pair that has been fitted
+
 
 @dataclass(frozen=True)
 class TableFit:
@@ -141,9 +143,6 @@ def fit_captures(
     return TableFit(table, tuple(fits), tuple(coc_px.tolist()), why, scale, colours)
 
 
-Report = Callable[[Capture], None]
-
-
 def _chosen(captures: Captures, family: str, accuracy_db: float, report: Report) -> tuple[str, str, Aperture | None]:
     """The family for all distances, why it was chosen, and the opening as seen from behind the focus, if it has one."""
     why = f"family {family!r} was asked for"
@@ -168,11 +167,8 @@ def _chosen(captures: Captures, family: str, accuracy_db: float, report: Report)
 
 def _fits(captures: Captures, family: str, opening: Aperture | None, report: Report) -> list[BlurFit]:
     """The fit of each distance, from the largest blur to the smallest: each expects the shape of the one before."""
-    focus, fit_of, larger = (
-        captures.focus_m,
-        dict[int, BlurFit](),
-        dict[bool, BlurFit](),
-    )  # larger: on each side of focus
+    focus, fit_of = captures.focus_m, dict[int, BlurFit]()
+    larger = dict[bool, BlurFit]()  # the next larger blur on each side of focus
     for i in np.argsort(-np.abs(captures.defocus)).tolist():
         pair, side = captures.pairs[i], bool(captures.defocus[i] > 0)
         aperture = None if opening is None else _seen(opening, pair, focus)

@@ -148,17 +148,16 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
 
     def _done(self, frames: Frames, files: Mapping[int, Path], record: Record) -> tuple[set[Path], str]:
         """The files that --resume keeps, which are listed, and why others are rendered again."""
-        reason, done = record.difference(), set[Path]()
         if not self.resume:
-            return done, reason
+            return set(), ""
         removed, young = remove_unfinished(self.out.parent)
         if removed:
             to_stderr(f"note: {self.out.parent}: removed {removed} unfinished files (.part) of killed runs")
         if young:
             writer = "another run is writing, or was killed a moment ago"
             to_stderr(f"note: {self.out.parent}: {young} unfinished files (.part) stay, which {writer}")
-        if reason:
-            return done, reason
+        if reason := record.difference():
+            return set(), reason
         sources = {n: [*frames.sources(n), frames.matte(n), *self.files()] for n in frames.read_for([*files])}
         done = record.kept(files, sources, self.steady)
         share = f"{self.out}: is" if frames.is_single else f"{len(done)} of {len(files)} frames are"
@@ -170,7 +169,8 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
         from .renderer import Renderer
 
         source = click.get_current_context().get_parameter_source("depth_kind")
-        is_sequence, is_auto = frames.images is not None, frames.images is not None and self.depth_kind == "auto"
+        is_sequence = frames.images is not None
+        is_auto = is_sequence and self.depth_kind == "auto"
         is_stated = source is not click.core.ParameterSource.DEFAULT or self.depth_scale is not None
         is_implied = is_sequence and self.strict and self.depth_kind == "z" and not is_stated
         of_frames = dataclasses.replace(self, depth_kind="z") if is_auto else self
@@ -180,8 +180,6 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
 
     def _reader(self, renderer: "Renderer", frames: Frames, numbers: Sequence[int]) -> "Callable[[int], Frame]":
         """Reads a frame, with its depth filtered along time if that is wanted."""
-        from ..depth.steady import SteadyFrames
-
         read_files, places = functools.lru_cache(maxsize=1)(renderer.read), frames.places()
 
         def as_stored(n: int) -> "Frame":  # a focus pull reads one image many times
@@ -189,6 +187,8 @@ class Render(Scene, Blur, Accuracy, _Effects, _Files, Command):
 
         if not (frames.images and self.steady):
             return as_stored
+        from ..depth.steady import SteadyFrames
+
         whole = frames.read_for(numbers)
         steady = SteadyFrames(lambda k: (as_stored(whole[k]).picture.pixels, as_stored(whole[k]).values))
 

@@ -223,7 +223,7 @@ extern "C" __global__ void __launch_bounds__(TILE_ROWS * TILE_COLUMNS) split_bac
     }
     const float near = torchdof::unlimited_on_near(n.nearness), far = torchdof::unlimited_on_far(n.nearness), valid = counts(r, n.pixel);
     const float of_sides = (within(near) ? of_nearer : 0.0f) - (within(far) ? of_farther : 0.0f);
-    const float of_nearness = (PLACE_SLOPE * n.unmixed * of_sides + of.by.covered * falloff(i, SOFTNESS_FALLOFF) * valid * s.per_counted) / s.gap;
+    const float of_nearness = (PLACE_SLOPE * n.unmixed * of_sides + of.by.covered * falloff(i, SOFTNESS_FALLOFF) * valid * s.per_counted) / s.mixed.gap;
     of.by.far_px += of_nearness;
     of.by.gap -= of_nearness * n.nearness;
     parts.at(OF_EDGE, i) = (i == MIDDLE ? of.by.edge : 0.0f) - falloff(i, FALLOFF) * valid * (of_nearer * clamp01(near) + of_farther * clamp01(far));

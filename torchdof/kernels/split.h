@@ -22,7 +22,7 @@ struct Light {
 // The split of a pixel at an edge. Light is relative to the brightest light around, `scale`.
 struct Split {
   Ends ends;
-  float gap, scale, per_scale;
+  float scale, per_scale;
   float total_nearer, total_farther;  // sums of the weights
   Colours clean, seen;                // of the clean light, and of the light without that of the other surface
   float per_strength;                 // of the contrast of the clean colours
@@ -33,7 +33,7 @@ struct Split {
   __device__ float light(const Run &r, const Pixel &q, int c) const { return light_of(r, q, c) * per_scale; }
   __device__ Neighbour neighbour(const Run &r, const Pixel &p, int i) const {
     Neighbour n = {p.around(r, i), 0, 0, 0, 0};
-    n.nearness = (ends.far - coc_of(r, n.pixel)) / gap;  // a division: the limits enlarge rounding
+    n.nearness = (ends.far - coc_of(r, n.pixel)) / mixed.gap;  // a division: the limits enlarge rounding
     n.unmixed = unmixed(r, n.pixel, i);
     n.nearer = n.unmixed * torchdof::on_near(n.nearness);
     n.farther = n.unmixed * torchdof::on_far(n.nearness);
@@ -93,7 +93,7 @@ __device__ inline Split split_of(const Run &r, const Pixel &p) {
   Split s = {};
   // Step 1: the two surfaces
   s.ends = ends_of(r, p);
-  s.gap = s.ends.far - s.ends.near;
+  s.mixed.gap = s.ends.far - s.ends.near;
 
   // Step 2: their colours
   s.scale = TINY;
@@ -120,7 +120,7 @@ __device__ inline Split split_of(const Run &r, const Pixel &p) {
   s.seen = s.colours(r, p, [&clean](const Light &l, int c) { return l.value[c] - l.limited * clean.contrast(c); });
 
   // Steps 3 and 4: the part of the pixel that the other surface covers
-  s.mixed.coc = coc_of(r, p), s.mixed.near_px = s.ends.near, s.mixed.far_px = s.ends.far, s.mixed.gap = s.gap;
+  s.mixed.coc = coc_of(r, p), s.mixed.near_px = s.ends.near, s.mixed.far_px = s.ends.far;
   s.mixed.edge = edge_of(r, p), s.mixed.covered = covered * s.per_counted, s.mixed.variance = s.seen.variance();
   EACH_CHANNEL s.own_light[c] = s.light(r, p, c);
   s.mixed.weigh(s.own_light, s.seen.near, s.seen.far);

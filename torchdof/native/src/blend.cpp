@@ -365,6 +365,8 @@ class Blend {
     vec swap(const vec *surfaces, int j) const {
       return S > 1 ? (swapped ? surfaces[S - 1 - j] : surfaces[j]) : surfaces[j];
     }
+    // The weight of surface j of the frame in the layer.
+    vec of_frame(int j) const { return S > 1 ? (swapped ? this->own(S - 1 - j) : this->own(j)) : this->own(j); }
   };
   template <int S>
   Pixels<S> weigh(const Layer &l, size_t at, int n) const {
@@ -432,14 +434,13 @@ class Blend {
       const Pixels<S> p = weigh<S>(l, at, n);
       if (over_) put(C + 1, p.beyond());
       if (!occupied) return;
-      vec share[S], given[S];
-      for (int j = 0; j < S; j++) share[j] = p.own(j);
-      for (int j = 0; j < S; j++) given[j] = p.swap(share, j);
+      vec given[S];
+      for (int j = 0; j < S; j++) given[j] = p.of_frame(j);
       for (int c = 0; c < C; c++) {
         const vec own = load_some(scene_.light[0] + c * map_ + at, n) * given[0];
         put(c, S > 1 ? own + load_some(scene_.light[S - 1] + c * map_ + at, n) * given[S - 1] : own);
       }
-      put(C, S > 1 ? share[0] + share[S - 1] : share[0]);
+      put(C, S > 1 ? given[0] + given[S - 1] : given[0]);
     });
   }
 
@@ -911,9 +912,8 @@ class Blend {
       const Pixels<S> p = weigh<S>(l, at, n);
       vec d_share[S] = {}, d_ahead[S], d_here[S], d_place[S], d_weight[S];
       if (occupied) {
-        vec share[S], given[S], more[S] = {};
-        for (int j = 0; j < S; j++) share[j] = p.own(j);
-        for (int j = 0; j < S; j++) given[j] = p.swap(share, j);
+        vec given[S], more[S] = {};
+        for (int j = 0; j < S; j++) given[j] = p.of_frame(j);
         for (int c = 0; c < C; c++) {
           const vec d_light = slope(c);
           for (int j = 0; j < S; j++) {

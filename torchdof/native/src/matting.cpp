@@ -212,7 +212,7 @@ void clean_light(const Frame &frame, int y0, int x0, Window &w, const float *fal
       }
       const SameSurface same(frame, w, at, falloff);
       const vec enough = same.total - FEW_CLEAN, is_clean = edge * clamp01(enough),
-                per_total = 1.0f / max(same.total, broadcast(1e-12f));
+                per_total = 1.0f / max(same.total, broadcast(LEAST));
       vec d_is_clean = {}, d_weight[TAPS] = {}, d_middle = {};
       for (int c = 0; c < frame.channels; c++) {
         const float *const light = &w.light[c * plane];
@@ -302,8 +302,7 @@ class Split {
   vec mean(const vec *light, const vec *weight, vec *mean) const {
     vec total = {}, variance = {};
     for (int i = 0; i < TAPS; i++) total += weight[i];
-    total = max(total,
-                broadcast(1e-12f));  // divided by, not multiplied with its inverse: equal values are exactly their mean
+    total = max(total, broadcast(LEAST));  // divided by, not times its inverse: equal values are exactly their mean
     for (int c = 0; c < C(); c++, light += TAPS) {
       vec one = {}, two = {};
       for (int i = 0; i < TAPS; i++) one += light[i] * weight[i];
@@ -319,7 +318,7 @@ class Split {
                     vec d_variance, vec *d_light, vec *d_weight) const {
     vec total = {};
     for (int i = 0; i < TAPS; i++) total += weight[i];
-    const vec each = 1.0f / max(total, broadcast(1e-12f));
+    const vec each = 1.0f / max(total, broadcast(LEAST));
     for (int i = 0; i < TAPS; i++) {
       vec sum = -d_variance * variance;
       for (int c = 0; c < C(); c++) {
@@ -356,7 +355,7 @@ class Split {
       small_[i] = (i == TAPS / 2 ? 1.0f : i % 2 ? SOFTNESS_FALLOFF : SOFTNESS_DIAGONAL) * valid_[i];
       mixed_.covered += small_[i] * nearness, counted += small_[i];
     }
-    per_counted_ = 1.0f / max(counted, broadcast(1e-12f));
+    per_counted_ = 1.0f / max(counted, broadcast(LEAST));
     mixed_.covered *= per_counted_;
 
     const vec per_scale = 1.0f / scale_;
@@ -602,7 +601,7 @@ void cover_block(Job &job, int by, int bx) {
       const int within = place_in_block(y, x);
       const float kept = (1.0f - certainty[at]) * block.weight[within], given = certainty[at] * weight[at],
                   both = kept + given;
-      const float per = both > 0 ? 1.0f / std::max(both, 1e-12f) : 0.0f;
+      const float per = both > 0 ? 1.0f / std::max(both, LEAST) : 0.0f;
       for (int c = 0; c < s.channels; c++) {
         float &other = block.other[c * BLOCK_PIXELS + within];
         other = (kept * other + certainty[at] * part[c * area + at] * s.light[c * area + at]) * per;

@@ -9,6 +9,7 @@
 #include "api.h"
 #include "constants/missed.h"
 #include "entry.h"
+#include "grid.h"
 #include "memory.h"
 #include "rules.h"
 #include "simd.h"
@@ -41,13 +42,13 @@ vec least_of(const float *at, int stride, int reach) {
   return min(min(before, load<vec>(at - reach * stride)), after);
 }
 
-class Missed {
+class Missed : Frame {
  public:
   explicit Missed(const torchdof_map &map)
-      : map_(map), height_(map.height), width_(map.width), channels_(map.channels), area_((size_t)height_ * width_),
-        across_((width_ + TILE - 1) / TILE), down_((height_ + TILE - 1) / TILE), pitch_(across_ * TILE),
-        rows_((height_ + CELL - 1) / CELL), columns_((width_ + CELL - 1) / CELL), cells_((size_t)rows_ * columns_),
-        plane_((size_t)pitch_ * height_), ring_(plane_), near_(plane_), coc_(plane_), roots_(channels_ * plane_) {}
+      : Frame(map.height, map.width), map_(map), channels_(map.channels), across_((width_ + TILE - 1) / TILE),
+        down_((height_ + TILE - 1) / TILE), pitch_(across_ * TILE), rows_((height_ + CELL - 1) / CELL),
+        columns_((width_ + CELL - 1) / CELL), cells_((size_t)rows_ * columns_), plane_((size_t)pitch_ * height_),
+        ring_(plane_), near_(plane_), coc_(plane_), roots_(channels_ * plane_) {}
 
   // Returns whether the map has changed; out is written only then. share: how far the map has missed parts, 0 to 1.
   bool run(double &share) {
@@ -410,8 +411,7 @@ class Missed {
     return changed;
   }
 
-  // Index of a pixel in a plane, and in one whose rows are padded to whole tiles; index of a cell.
-  size_t pixel(int y, int x) const { return (size_t)y * width_ + x; }
+  // Index of a pixel in a plane whose rows are padded to whole tiles; index of a cell.
   size_t padded(int y, int x) const { return (size_t)y * pitch_ + x; }
   size_t cell(int y, int x) const { return (size_t)y * columns_ + x; }
 
@@ -423,8 +423,7 @@ class Missed {
   }
 
   const torchdof_map &map_;
-  const int height_, width_, channels_;
-  const size_t area_;
+  const int channels_;
   const int across_, down_, pitch_;  // tiles along both axes, pixels of whole tiles
   const int rows_, columns_;         // of cells
   const size_t cells_;
