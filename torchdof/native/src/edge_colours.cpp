@@ -5,6 +5,7 @@
 #include <cstdint>
 #include <vector>
 
+#include "edge_rules.h"
 #include "memory.h"
 #include "sample_window.h"
 #include "simd.h"
@@ -86,11 +87,10 @@ class Colours : EdgeMap {
     std::vector<float> values;  // of LANES pixels each: totals of both surfaces, and the pixels' own colours
   };
 
-  // Likelihoods and surfaces of the pixels of some windows, and how alike the pixels around each one are.
-  struct Likelihoods {
+  // Sums over the windows of some pixels: likelihoods and surfaces, and how alike the pixels around each one are.
+  struct Samples {
     float likely[2][LANES], surfaces[2][LANES], blurs[LANES];
-    Likelihoods(const Edge *edges, int pixels, const Windows &windows, vec per_spread, bool wants_surfaces,
-                float *around) {
+    Samples(const Edge *edges, int pixels, const Windows &windows, vec per_spread, bool wants_surfaces, float *around) {
       for (int l = 0; l < pixels; l++) {
         const Window &window = windows.of_pixel[l];
         const float *apart_at = (const float *)window.apart + REACH * WHOLE + REACH;
@@ -106,7 +106,7 @@ class Colours : EdgeMap {
             parts[4 + side] += part * window.values[n];
           }
         }
-        blurs[l] = more_blurred(edges[l]);
+        blurs[l] = more_blurred(edges[l].near, edges[l].far);
         for (int side = 0; side < 2; side++) {
           likely[side][l] = reduce_add(parts[side]);
           surfaces[side][l] =
@@ -181,47 +181,22 @@ class Colours : EdgeMap {
 
   // Steps 2 to 5 of `judge` for up to LANES pixels at once, from pixel `first` of a group on.
   void score(Group &group, size_t first, int pixels, const Windows &windows, int channels, bool wants_surfaces) const {
-    const vec none = {}, one = broadcast(1.0f);
     const auto of = [&](int n) { return load<vec>(&windows.values[n * LANES]); };
     const int count = 4 + 2 * channels;
-    const vec per_total[2] = {1.0f / of(0), 1.0f / of(1)};
-    vec square = none, contrast = none, noise = none, from_mean[2] = {none, none}, along = none;
-    for (int c = 0; c < channels; c++) {
-      const vec mine = of(count + c), near_off = of(4 + 2 * c) * per_total[0], far_off = of(5 + 2 * c) * per_total[1],
-                both = 2.0f * mine + near_off + far_off;
-      square += mine * mine;
-      from_mean[0] += near_off * near_off;
-      from_mean[1] += far_off * far_off;
-      contrast += (near_off - far_off) * (near_off - far_off);
-      along += far_off * (far_off - near_off);  // from the far surface's colour towards the near one's
-      noise += both * both;
-    }
-    vec spread = COLOUR_NOISE * noise + 1e-12f;
-    for (int side = 0; side < 2; side++) spread += 0.5f * max(of(2 + side) * per_total[side] - from_mean[side], none);
-    const vec per_light = 1.0f / (SIMILAR * square + 1e-12f), per_spread = 1.0f / (SPREAD * spread);
-    const auto is_known = (of(0) > LEAST_SEEN) & (of(1) > LEAST_SEEN);  // else the neighbours decide
-    const vec reliability =
-        is_known ? max(contrast / (contrast + 0.5f * spread) - INSEPARABLE, none) / (1.0f - INSEPARABLE) : one;
-    const vec share = max(min(along / max(contrast, broadcast(1e-12f)), one), none);
-    const vec unmixed = 1.0f + max(from_mean[1] - share * (2.0f * along - share * contrast), none) / spread;
-    const vec mixed = wants_surfaces && map_.is_coc ? MIXTURE / (unmixed * unmixed) : none;
+    const Separation<vec> s(channels, of, [&](int c) { return of(count + c); });
     float *const around = group.around[first / LANES].alike[0];
-    const Likelihoods found(&group.edges[first], pixels, windows, per_spread, wants_surfaces, around);
-    for (int n = 0; n < 8; n++) store(around + n * LANES, 1.0f / (1.0f + load<vec>(around + n * LANES) * per_light));
-    vec likelihood[2];
-    for (int side = 0; side < 2; side++) likelihood[side] = load<vec>(found.likely[side]) * per_total[side] + 1e-9f;
-    likelihood[0] += mixed * load<vec>(found.blurs);
-    const vec likeliest = is_known ? min(max(likelihood[0], likelihood[1]) / LIKELY, one) : one;
-    const vec odds = likelihood[0] / likelihood[1],
-              clear = min(min(of(0), of(1)) / (wants_surfaces ? CLEAR : CLEAR_IN_PRIOR), one);
+    const Samples found(&group.edges[first], pixels, windows, s.per_spread, wants_surfaces, around);
+    for (int n = 0; n < 8; n++) store(around + n * LANES, 1.0f / (1.0f + load<vec>(around + n * LANES) * s.per_light));
+    const vec mixed = wants_surfaces && map_.is_coc ? s.mixed * load<vec>(found.blurs) : vec{};
+    const Likelihoods<vec> likelihoods(s, load<vec>(found.likely[0]), load<vec>(found.likely[1]), mixed,
+                                       wants_surfaces ? CLEAR : CLEAR_IN_PRIOR);
     for (int l = 0; l < pixels; l++) {
       const Edge &edge = group.edges[first + l];
-      score_[edge.i] =
-          is_known[l] ? std::clamp(std::log(odds[l]), -MOST_ODDS, MOST_ODDS) * (marks_[edge.i] & RAMP ? 1.0f : clear[l])
-                      : 0.0f;
-      evidence_[edge.i] = likeliest[l];
-      group.judged[first + l] = {0.0f, reliability[l], is_known[l] ? found.surfaces[0][l] : edge.near,
-                                 is_known[l] ? found.surfaces[1][l] : edge.far};
+      const float odds = std::clamp(std::log(likelihoods.odds[l]), -MOST_ODDS, MOST_ODDS);
+      score_[edge.i] = s.is_known[l] ? odds * (marks_[edge.i] & RAMP ? 1.0f : likelihoods.trust[l]) : 0.0f;
+      evidence_[edge.i] = likelihoods.evidence[l];
+      group.judged[first + l] = {0.0f, s.reliability[l], s.is_known[l] ? found.surfaces[0][l] : edge.near,
+                                 s.is_known[l] ? found.surfaces[1][l] : edge.far};
     }
   }
 

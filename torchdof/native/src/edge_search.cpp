@@ -8,6 +8,7 @@
 #include <cstring>
 #include <vector>
 
+#include "edge_rules.h"
 #include "memory.h"
 #include "rules.h"
 #include "simd.h"
@@ -215,21 +216,17 @@ class Search : EdgeMap {
     for (int x = m.inner.x0, k = 0; x < m.inner.right(); x += LANES, k += LANES) {
       const vec s = steps_at(y, x), v = load<vec>(m.raw.at(y, x)), is_ramp = load<vec>(m.ramp.at(y, x));
       const auto is_valid = abs(v) <= LARGEST;
-      vec near = load<vec>(m.nears[RINGS - 1].at(y, x)), far = load<vec>(m.fars[RINGS - 1].at(y, x)), unsure = {};
-      if (!any_of((near + far > s) | (is_ramp > none))) {  // no step is large enough
+      const auto within = [&](int r) -> Extremes<vec> {
+        return {load<vec>(m.nears[r].at(y, x)), load<vec>(m.fars[r].at(y, x)), load<vec>(m.jumps[r].at(y, x))};
+      };
+      const Extremes<vec> widest = within(RINGS - 1);
+      if (!any_of((widest.near + widest.far > s) | (is_ramp > none))) {  // no step is large enough
         store(marks + k, is_valid ? none : broadcast((float)UNSURE * (RINGS + 1)));
         continue;
       }
-      const vec least_gap = max(NEAREST * (near + far), s);
-      for (int r = RINGS - 1; r >= 0; r--) {
-        const vec n = load<vec>(m.nears[r].at(y, x)), f = load<vec>(m.fars[r].at(y, x)), gap = n + f;
-        const auto is_step = (gap > least_gap) & (load<vec>(m.jumps[r].at(y, x)) > ABRUPT * gap);
-        near = is_step ? n : near;
-        far = is_step ? f : far;
-        unsure = is_step ? broadcast((float)(RINGS - r)) : unsure;
-      }
-      near = is_ramp > none ? load<vec>(m.up.at(y, x)) : near;
-      far = is_ramp > none ? -load<vec>(m.down.at(y, x)) : -far;
+      const Step<vec> step(s, within);
+      const vec near = is_ramp > none ? load<vec>(m.up.at(y, x)) : step.near, unsure = step.unsure;
+      const vec far = is_ramp > none ? -load<vec>(m.down.at(y, x)) : -step.far;
       const auto is_edge = (is_ramp + unsure > none) & (near - far > s) & is_valid;
       const vec is_near = 2.0f * v > near + far ? one : none;
       const vec mark = is_near * (float)NEAR + is_ramp * (float)RAMP;
@@ -259,12 +256,10 @@ class Search : EdgeMap {
     const vec none = {}, one = broadcast(1.0f);
     const vec right = load<vec>(m.high.at(y, x + 2)) - load<vec>(m.high.at(y, x - 2));
     const vec below = load<vec>(m.high.at(y + 2, x)) - load<vec>(m.high.at(y - 2, x));
-    const vec across = abs(right) > abs(below) + TIE * gap ? (right > none ? one : -one) : none;
-    const vec along = abs(below) > abs(right) + TIE * gap ? (below > none ? one : -one) : none;
     const ivec of_level = convert(min(max(level * (float)LEVELS, none), broadcast(LEVELS - 1.0f)));
     const vec on_step = (level > 0.5f ? broadcast((float)RINGS) : none) + (float)RINGS - unsure;
     const vec place = is_ramp > none ? 2.0f * RINGS + convert(of_level) : on_step;
-    return convert(place * (float)DIRECTIONS + 2.0f * along + across + (float)(DIRECTIONS / 2));
+    return convert(place * (float)DIRECTIONS + direction(right, below, gap) + (float)(DIRECTIONS / 2));
   }
 
   // Adds an edge pixel to the statistics.
@@ -285,10 +280,9 @@ class Search : EdgeMap {
       const vec here = load<vec>(at);
       const vec x0 = known(here - load<vec>(at - 1)), x1 = known(load<vec>(at + 1) - here);
       const vec y0 = known(here - load<vec>(at - raw.pitch)), y1 = known(load<vec>(at + raw.pitch) - here);
-      const vec ax0 = abs(x0), ax1 = abs(x1), ay0 = abs(y0), ay1 = abs(y1);
-      const vec sx = x0 * x1 > vec{} ? min(ax0, ax1) : vec{}, sy = y0 * y1 > vec{} ? min(ay0, ay1) : vec{};
-      store(slope.at(y, x), max(sx, sy));
-      store(jump.at(y, x), max(max(ax0, ax1) - sx, max(ay0, ay1) - sy));
+      const Slope<vec> found(x0, x1, y0, y1);
+      store(slope.at(y, x), found.slope);
+      store(jump.at(y, x), found.jump);
     });
   }
 

@@ -10,6 +10,7 @@
 #include "constants/edge_colours.h"
 #include "constants/edges.h"
 #include "edge_colours.h"
+#include "edge_rules.h"
 #include "edge_map.h"
 #include "edge_search.h"
 #include "entry.h"
@@ -282,7 +283,7 @@ class Repair : Planes, EdgeMap {
       const float score = group.judged[k].score;
       const Edge &edge = group.edges[k];
       return score + prior[edge.kind] + lean * clamp01(std::fabs(score) - 1.0f) +
-             (is_soft ? to_blurred * more_blurred(edge) : 0.0f);
+             (is_soft ? to_blurred * more_blurred(edge.near, edge.far) : 0.0f);
     };
     std::vector<std::vector<float>> chances(groups.size());
     for (int round = 0; is_soft && round < DECIDED_ROUNDS; round++) {
