@@ -15,13 +15,14 @@ import sys
 import tempfile
 from pathlib import Path
 
-from torchdof.kernels import layers, loader, matting
+from torchdof.kernels import edges, layers, loader, matting
 
 ROOT = Path(__file__).parents[1]
 COMPILER = os.environ.get("CXX") or shutil.which("c++")
 _SOURCES = [ROOT / "torchdof" / "kernels", ROOT / "torchdof" / "native" / "src"]
 
 _BEFORE = """
+#include <cmath>
 #define __global__
 #define __device__
 #define __grid_constant__
@@ -109,3 +110,8 @@ def layers_module(channels: int, surfaces: int, stacked: bool, device: int = 0) 
 def matting_module(channels: int, device: int = 0) -> loader.Launch:
     """As :func:`torchdof.kernels.matting.module`, with that driver."""
     return _module("matting.cu", "-O1", *matting.options(channels))
+
+
+def edges_module(channels: int, device: int = 0) -> loader.Launch:
+    """As :func:`torchdof.kernels.edges.module`, with that driver."""
+    return _module("edges.cu", "-O3", *edges.options(channels))

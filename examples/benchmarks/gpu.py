@@ -32,7 +32,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from examples.benchmarks.steps import Counted, crops
 from torchdof import blur_by_coc, native
 from torchdof.functional import splat
-from torchdof.kernels import layers, loader, matting
+from torchdof.kernels import edges, layers, loader, matting
 from torchdof.render.engines import on_gpu
 
 HAS_DEVICE = torch.cuda.is_available()
@@ -94,8 +94,8 @@ class Launches:
         self.ms: dict[str, float] = collections.defaultdict(float)
 
     def __enter__(self) -> "Launches":
-        self._modules = layers.module, matting.module
-        of_layers, of_matting = self._modules
+        self._modules = layers.module, matting.module, edges.module
+        of_layers, of_matting, of_edges = self._modules
 
         def counted_layers(*variant: Any) -> loader.Launch:
             return self._counted(of_layers(*variant), functools.partial(cost, channels=variant[0], surfaces=variant[1]))
@@ -103,11 +103,14 @@ class Launches:
         def counted_matting(*variant: Any) -> loader.Launch:
             return self._counted(of_matting(*variant), functools.partial(cost_of_matting, channels=variant[0]))
 
-        layers.module, matting.module = counted_layers, counted_matting  # type: ignore[assignment]
+        def counted_edges(*variant: Any) -> loader.Launch:
+            return self._counted(of_edges(*variant), functools.partial(cost_of_edges, channels=variant[0]))
+
+        layers.module, matting.module, edges.module = counted_layers, counted_matting, counted_edges  # type: ignore
         return self
 
     def __exit__(self, *_: Any) -> None:
-        layers.module, matting.module = self._modules
+        layers.module, matting.module, edges.module = self._modules
 
     def _counted(self, launch: loader.Launch, cost_of: Callable[..., tuple[float, float]]) -> loader.Launch:
         """A launch that is counted. Without a device the layers are not computed, only their tables of tiles."""
@@ -162,6 +165,22 @@ def cost_of_matting(kernel: str, r: Any, items: int, channels: int) -> tuple[flo
     count = int((torch.frombuffer(edges, dtype=torch.float32) > 0).sum())
     values, operations = of_edge.get(kernel, (0, 0))
     return 4.0 * (of_pixel[kernel] * pixels + values * count), float(operations * count)
+
+
+def cost_of_edges(kernel: str, r: Any, items: int, channels: int) -> tuple[float, float]:
+    """As :func:`cost`, for the kernels of edges."""
+    of_pixel = {  # values of each pixel that are read or written, and operations
+        "find_slopes": (5, 40),
+        "smooth_slopes": (2, 25),
+        "find_ramps": (6, 5),
+        "climb_ramps": (5, 2),
+        "find_surfaces": (16, 49 * 12),
+    }
+    if kernel in of_pixel:
+        values, operations = (n * r.height * r.width * items for n in of_pixel[kernel])
+        return 4.0 * values, float(operations)
+    window = 2 * 121 if kernel == "judge" else 9  # samples of each pixel of the list
+    return 4.0 * r.count * (channels + 10), float(r.count * window * (10 + 5 * channels))
 
 
 def cost(kernel: str, r: Any, depth: int, channels: int, surfaces: int) -> tuple[float, float]:
@@ -226,7 +245,9 @@ def on_cpu() -> None:
     """Takes tensors on the CPU for those of a device, whose kernels are their C++ build."""
     from tests import on_cpu
 
-    on_gpu.DEVICE, layers.module, matting.module = "cpu", on_cpu.layers_module, on_cpu.matting_module  # type: ignore[assignment]
+    on_gpu.DEVICE = "cpu"
+    layers.module, matting.module = on_cpu.layers_module, on_cpu.matting_module  # type: ignore[assignment]
+    edges.module = on_cpu.edges_module  # type: ignore[assignment]
     native._library = lambda: (None, "switched off")  # as on a device: all else by PyTorch, items together
 
 
@@ -261,7 +282,7 @@ def first_use() -> None:
     """Seconds until the first picture: compiled and tried, then with the kept program."""
     _, light, coc_px = scene(*SMALL_CASES[0])
     for name in ("without kernels", "kernels compiled", "the kept program"):
-        for cached in (layers.module, matting.module, on_gpu.why_missing):
+        for cached in (layers.module, matting.module, edges.module, on_gpu.why_missing):
             getattr(cached, "cache_clear", lambda: None)()
         start = time.perf_counter()
         with engine("torch" if name == "without kernels" else "gpu"):
@@ -297,7 +318,7 @@ def costs(ends: float) -> None:
                 print(f"{name}, a {kind}: {found[0]}; without kernels {found[1]}", flush=True)
             with Launches() as launches, Counted() as counted:
                 call(light, coc_px)
-            launches.show(f"{name}, matting and layers of a {kind}")
+            launches.show(f"{name}, edges, matting and layers of a {kind}")
             with engine("torch"), Counted() as plain:
                 call(light, coc_px)
             print(f"  {counted.operations} operations of PyTorch, without kernels {plain.operations}", flush=True)

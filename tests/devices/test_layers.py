@@ -11,7 +11,7 @@ from torch import Tensor
 
 from tests.scenes import CAMERA, CASES, Case, assert_same_picture, post_before_lamps, random_scene
 from torchdof import BlurTable, DepthOfField, blur_by_coc
-from torchdof.kernels import layers, loader, matting
+from torchdof.kernels import edges, layers, loader, matting
 from torchdof.render import pipeline
 from torchdof.render.engines import on_gpu
 from torchdof.render.layers import composite
@@ -221,7 +221,7 @@ def test_without_kernels_there_is_one_warning_and_the_plain_engines_picture(
     def missing(*variant: Any) -> loader.Launch:
         raise OSError("NVRTC of CUDA 12.8 was not found")
 
-    for kernels in (layers, matting):
+    for kernels in (edges, layers, matting):
         monkeypatch.setattr(kernels, "module", missing)
     monkeypatch.setenv("TORCHDOF_ENGINE", "auto")
     with pytest.warns(RuntimeWarning, match="slower: NVRTC of CUDA 12.8 was not found") as warned:

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from tests import on_cpu
-from torchdof.kernels import layers, loader, matting
+from torchdof.kernels import edges, layers, loader, matting
 
 CUDA = "12.9"
 
@@ -32,6 +32,8 @@ VARIANTS = {
     ("layers.cu", "largest"): layers.options(layers.MOST_CHANNELS, layers.MOST_SURFACES, True),
     ("matting.cu", "image"): matting.options(3),
     ("matting.cu", "largest"): matting.options(matting.MOST_CHANNELS),
+    ("edges.cu", "image"): edges.options(3),
+    ("edges.cu", "largest"): edges.options(edges.MOST_CHANNELS),
 }
 THREADS = {"composite": 128, "convolve_back": 128, "sum_rows": 32}  # of a block
 
@@ -44,6 +46,8 @@ THREADS = {"composite": 128, "convolve_back": 128, "sum_rows": 32}  # of a block
         ("layers.cu", "largest", 75),
         *(("matting.cu", "image", capability) for capability in (75, 90, 120)),
         ("matting.cu", "largest", 80),
+        *(("edges.cu", "image", capability) for capability in (75, 90, 120)),
+        ("edges.cu", "largest", 80),
     ],
 )
 def test_kernels_compile_for_every_device_without_spills(source: str, variant: str, capability: int) -> None:

@@ -19,10 +19,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-_CONSTANTS = ("composite", "disocclusion", "doubt", "frame", "layer_weights", "matting")
+_CONSTANTS = (
+    *("composite", "disocclusion", "doubt", "edge_colours", "edge_search"),
+    *("frame", "layer_weights", "matting", "windows"),
+)
 HEADERS = (
-    *("frame.h", "weights.h", "matting.h", "split.h"),
-    *("mixed_pixel.h", "mixture.h", "rules.h", "numbers.h"),
+    *("frame.h", "weights.h", "matting.h", "split.h", "pixel.h"),
+    *("edge_rules.h", "mixed_pixel.h", "mixture.h", "rules.h", "numbers.h"),
     *(f"constants/{name}.h" for name in _CONSTANTS),
 )
 """Files beside this one that kernels include; the build installs those that the compiled engine includes too."""

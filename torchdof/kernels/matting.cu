@@ -142,7 +142,7 @@ struct Parts {
     float nearest = 0, farthest = 0;
     for (int pass = 0; pass < 2; pass++) {
       TAP_BY_TAP for (int i = 0; i < TAPS; i++) {
-        const Pixel q = p.around(r, i);
+        const Pixel q = around(r, p, i);
         const bool is_near = counts(r, q) > 0 && coc_of(r, q) == e.near, is_far = counts(r, q) > 0 && coc_of(r, q) == e.far;
         if (pass)
           at(OF_COC, i) += (is_near ? of_near / nearest : 0.0f) + (is_far ? of_far / farthest : 0.0f);
@@ -239,12 +239,12 @@ extern "C" __global__ void gather(const __grid_constant__ Run r) {
   const bool is_border = p.y == 0 || p.x == 0 || p.y == r.height - 1 || p.x == r.width - 1;
   float sum[VALUES] = {};
   TAP_BY_TAP for (int i = 0; i < TAPS; i++) {
-    const Pixel q = p.around(r, i);
+    const Pixel q = around(r, p, i);
     if (q.y != p.y + i / 3 - 1 || q.x != p.x + i % 3 - 1 || !(edge_of(r, q) > 0)) continue;
     const Parts parts(r, q);
     const int opposite = TAPS - 1 - i;
     TAP_BY_TAP for (int j = is_border ? 0 : opposite; j <= (is_border ? TAPS - 1 : opposite); j++) {
-      const Pixel o = q.around(r, j);
+      const Pixel o = around(r, q, j);
       if (o.y != p.y || o.x != p.x) continue;
       EACH_VALUE if (n < r.planes) sum[n] += parts.at(r.first + n, j);
     }
@@ -268,7 +268,7 @@ extern "C" __global__ void find_clean_back(const __grid_constant__ Run r) {
     of_taken += of_clean[c] * (s.mean[c] - light_of(r, p, c));
   }
   TAP_BY_TAP for (int i = 0; i < TAPS; i++) {
-    const Pixel q = p.around(r, i);
+    const Pixel q = around(r, p, i);
     const float apart = s.apart(r, q), alike = s.alike(apart), weight = s.weight(r, q, i);
     float of_weight = within(s.enough) ? of_taken * s.edge : 0.0f;
     EACH_CHANNEL {

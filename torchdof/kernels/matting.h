@@ -11,7 +11,6 @@ using torchdof::TINY;
 using torchdof::within;
 using namespace torchdof::constants::matting;
 
-constexpr int TILE_ROWS = 4, TILE_COLUMNS = 32;  // a block of threads, as in matting.py
 constexpr int TAPS = 9, MIDDLE = TAPS / 2;       // pixels around one, row by row
 // Planes of the surfaces: own light, other light, coc and weight of the other surface
 constexpr int OTHER = CHANNELS, COC = 2 * CHANNELS, WEIGHT = COC + 1, PLANES = WEIGHT + 1;
@@ -51,22 +50,10 @@ struct Run {
   int first;   // the first of them
 };
 
-// A pixel of an item; those around it are counted row by row, and those of the border are repeated.
-struct Pixel {
-  int item, y, x;
-  __device__ Pixel() : item(blockIdx.z), y(blockIdx.y * TILE_ROWS + threadIdx.y), x(blockIdx.x * TILE_COLUMNS + threadIdx.x) {}
-  __device__ bool is_in(const Run &r) const { return y < r.height && x < r.width; }
-  // Its index in a map with a number of planes.
-  __device__ long long in(const Run &r, int planes, int plane) const { return ((long long)(item * planes + plane) * r.height + y) * r.width + x; }
-  // One of the 3 x 3 pixels around.
-  __device__ Pixel around(const Run &r, int i) const {
-    Pixel q = *this;
-    q.y = torchdof::min(torchdof::max(y + i / 3 - 1, 0), r.height - 1);
-    q.x = torchdof::min(torchdof::max(x + i % 3 - 1, 0), r.width - 1);
-    return q;
-  }
-};
+#include "pixel.h"
 
+// One of the 3 x 3 pixels around, counted row by row.
+__device__ inline Pixel around(const Run &r, const Pixel &p, int i) { return p.at(r, i / 3 - 1, i % 3 - 1); }
 __device__ inline float falloff(int i, float beside) { return i == MIDDLE ? 1.0f : i % 2 ? beside : beside * beside; }
 __device__ inline float coc_of(const Run &r, const Pixel &p) { return r.coc[p.in(r, 1, 0)]; }
 __device__ inline float edge_of(const Run &r, const Pixel &p) { return r.edge[p.in(r, 1, 0)]; }
@@ -81,7 +68,7 @@ struct Ends {
 __device__ inline Ends ends_of(const Run &r, const Pixel &p) {
   Ends e = {NEVER_PX, -NEVER_PX};
   TAP_BY_TAP for (int i = 0; i < TAPS; i++) {
-    const Pixel q = p.around(r, i);
+    const Pixel q = around(r, p, i);
     if (!(counts(r, q) > 0)) continue;
     e.near = torchdof::min(e.near, coc_of(r, q));
     e.far = torchdof::max(e.far, coc_of(r, q));
@@ -102,11 +89,11 @@ struct Same {
 };
 __device__ inline Same same_surface(const Run &r, const Pixel &p) {
   Same s = {coc_of(r, p), edge_of(r, p), 0, 0, {}};
-  TAP_BY_TAP for (int i = 0; i < TAPS; i++) s.total += s.weight(r, p.around(r, i), i);
+  TAP_BY_TAP for (int i = 0; i < TAPS; i++) s.total += s.weight(r, around(r, p, i), i);
   s.enough = s.total - FEW_CLEAN;
   s.total = torchdof::max(s.total, LEAST);
   TAP_BY_TAP for (int i = 0; i < TAPS; i++) {
-    const Pixel q = p.around(r, i);
+    const Pixel q = around(r, p, i);
     const float weight = s.weight(r, q, i);
     EACH_CHANNEL s.mean[c] += light_of(r, q, c) * weight;
   }

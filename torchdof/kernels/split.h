@@ -32,7 +32,7 @@ struct Split {
 
   __device__ float light(const Run &r, const Pixel &q, int c) const { return light_of(r, q, c) * per_scale; }
   __device__ Neighbour neighbour(const Run &r, const Pixel &p, int i) const {
-    Neighbour n = {p.around(r, i), 0, 0, 0, 0};
+    Neighbour n = {around(r, p, i), 0, 0, 0, 0};
     n.nearness = (ends.far - coc_of(r, n.pixel)) / mixed.gap;  // a division: the limits enlarge rounding
     n.unmixed = unmixed(r, n.pixel, i);
     n.nearer = n.unmixed * torchdof::on_near(n.nearness);

@@ -1,4 +1,5 @@
-"""Matting and layers on a CUDA device, by the kernels of :mod:`torchdof.kernels`, forward and backward.
+"""Steps of the picture on a CUDA device, by the kernels of :mod:`torchdof.kernels`: matting and layers, forward and
+backward, and the search for edges of depth.
 
 Before a device first uses some kernels, they and the plain engine compute a small frame. If the results or the
 gradients differ, or if the kernels cannot be compiled, the plain engine is used from then on, with one warning that
@@ -15,12 +16,16 @@ import torch
 from torch import Tensor
 
 from ... import native
-from ...kernels import layers, matting
+from ...kernels import edges, layers, matting
 from ...tensors import is_differentiated, is_in_memory, is_traced, without_autocast
 from ..layers.layer_weights import ramps
+from ..surfaces import edge_colours, edge_search
+from ..surfaces.edge_colours import Looks, Shown
+from ..surfaces.edge_search import Edges
 from ..surfaces.frame import PaddedFrame, PaddedSurface, maps_of, surfaces_of
 from ..surfaces.matting import Matted
 from ..surfaces.matting import matte as plain_matte
+from ..surfaces.windows import mean_around
 from .compiled_steps import differentiable
 from .ops import EAGER, Ops
 
@@ -29,6 +34,8 @@ DEVICE = "cuda"
 
 _NEAR = 1e-5  # largest difference between the results of both engines, of the light
 _NEAR_GRADIENT = 1e-4  # the same of their gradients, of the norm
+
+_FLAGS_OF_TRIAL = ((True, False), (False, True))  # of judge: the prior, and mixtures
 
 Kernels = Sequence[tuple[Tensor, int]]
 """Kernel ``[1 or C, k, k]`` or ``[B, 1 or C, k, k]`` of each layer, near to far, and the size of its pixels."""
@@ -70,6 +77,38 @@ def matte(
     return Matted(*_matte_by_kernels(light, coc_px, valid, covered).split([channels, channels, 1, 1], 1))
 
 
+def find_edges(light: Tensor, nearness: Tensor, valid: Tensor, step: Tensor) -> Edges:
+    """:func:`torchdof.render.surfaces.edge_search.find` for the map of an image ``[B, C, H, W]``, by kernels of a GPU.
+
+    Raises:
+        ValueError: If they cannot be used and ``TORCHDOF_ENGINE`` is ``gpu``.
+    """
+    if _has_no_edge_kernels(light, nearness):
+        return edge_search.find(nearness, valid, step)
+    return _edges_by_kernels(light, nearness, valid, step)
+
+
+def judge(
+    looks: Looks, like: Tensor, edge_pixels: Tensor, sharpness: Tensor, in_prior: bool, mixtures: bool, ops: Ops
+) -> Shown:
+    """:func:`torchdof.render.surfaces.edge_colours.judge`, by kernels of a GPU if they compute it.
+
+    Raises:
+        ValueError: If they cannot be used and ``TORCHDOF_ENGINE`` is ``gpu``.
+    """
+    if _has_no_edge_kernels(looks.colour[None], like):
+        return edge_colours.judge(looks, like, edge_pixels, sharpness, in_prior, mixtures, ops)
+    return _judged_by_kernels(looks, like, edge_pixels, sharpness, in_prior, mixtures)
+
+
+def _has_no_edge_kernels(light: Tensor, like: Tensor) -> bool:
+    """Whether PyTorch finds and judges edges, for light ``[B, C, ...]`` and a map of the frame."""
+    channels = light.shape[1]
+    # the number of items after `takes`, as in `composited`
+    is_taken = takes([light, like], channels, 1) and len(like) <= edges.MOST_ITEMS
+    return not is_taken or _missing(_edges_of_trial, channels, like.device.index or 0)
+
+
 def takes(maps: Sequence[Tensor], channels: int, surfaces: int) -> bool:
     """Whether the kernels are wanted, and render maps with these numbers of channels and of surfaces in a pixel."""
     if is_traced() or native.wanted() == "torch":
@@ -109,7 +148,9 @@ def why_missing(trial: Trial, *variant: Any) -> str:
             results = []
             for compute in engines:
                 result = compute(*maps)
-                results.append((result.detach(), *torch.autograd.grad(result.square().sum(), maps)))
+                has_gradients = result.requires_grad
+                gradients = torch.autograd.grad(result.square().sum(), maps) if has_gradients else ()
+                results.append((result.detach(), *gradients))
     except Exception as error:  # of any kind: the plain engine needs none of this
         return str(error) or type(error).__name__
     (result, *of_plain), (other, *of_kernels) = results
@@ -166,6 +207,45 @@ def _matte_of_trial(channels: int, device: int) -> Any:
         lambda *maps: weighted(plain_matte(*maps)),
         lambda *maps: weighted(_matte_by_kernels(*maps).split([channels, channels, 1, 1], 1)),
     )
+
+
+def _edges_of_trial(channels: int, device: int) -> Any:
+    """A small image of patches, each with a random colour and nearness, some of which end in ramps."""
+    dice = torch.Generator().manual_seed(0)
+    light, nearness = (torch.rand(1, n, 4, 6, generator=dice).repeat_interleave(9, 2) for n in (channels, 1))
+    light, nearness = (t.repeat_interleave(9, 3) for t in (light, nearness))
+    nearness[..., 18:, :] = mean_around(nearness, 2)[..., 18:, :]
+    light = (light + 0.3 * torch.rand(light.shape, generator=dice)) / 1.3
+
+    def shown(find: Callable[..., Edges], decide: Callable[..., Shown], light: Tensor, nearness: Tensor) -> Tensor:
+        valid, every = nearness > -1e6, torch.arange(nearness.numel(), device=nearness.device)
+        found = find(light, nearness, valid, torch.full_like(nearness, 1.0))
+        found = found._replace(direction=found.direction * found.is_edge)  # elsewhere it has no meaning
+        looks = Looks.of(light, nearness, valid, found)
+        judged = [decide(looks, nearness, every, nearness.new_tensor([0.5]), *flags) for flags in _FLAGS_OF_TRIAL]
+        maps = [*found, *(values.view_as(nearness) for each in judged for values in each)]
+        return 0.1 * torch.cat([values.detach().to(nearness.dtype) for values in maps], 1)  # 0 to 1, about
+
+    def plain(*judged: Any) -> Shown:
+        return edge_colours.judge(*judged, EAGER)
+
+    return (
+        [light, 8.0 * nearness],
+        functools.partial(shown, lambda light, *maps: edge_search.find(*maps), plain),
+        functools.partial(shown, _edges_by_kernels, _judged_by_kernels),
+    )
+
+
+def _edges_by_kernels(light: Tensor, nearness: Tensor, valid: Tensor, step: Tensor) -> Edges:
+    maps = (nearness.contiguous(), valid.contiguous(), step.expand_as(nearness).contiguous())
+    return Edges(*edges.find(*maps, edge_search.RAMP_REACH, light.shape[1]))
+
+
+def _judged_by_kernels(
+    looks: Looks, like: Tensor, edge_pixels: Tensor, sharpness: Tensor, in_prior: bool, mixtures: bool
+) -> Shown:
+    maps = (looks.maps.contiguous(), like, edge_pixels, edge_colours.falloff(like.dtype, like.device))
+    return Shown(*edges.judge(*maps, sharpness, in_prior, mixtures))
 
 
 def _matte_by_kernels(

@@ -6,21 +6,22 @@ import torch
 from torch import Tensor
 
 from ... import pixels
+from ...optics.kernel_cache import kept
 from ..engines.ops import Ops
 from ..rules import active
 from .edge_search import REACH, Edges
 from .windows import gaussian
 
 __all__ = [
-    *("CLEAR", "CLEAR_IN_PRIOR", "SHARPNESS", "SOFT_SHARPNESS"),
-    *("Looks", "Shown", "finite_light", "judge", "more_blurred"),
+    *("SHARPNESS", "SOFT_SHARPNESS"),
+    *("Looks", "Shown", "falloff", "finite_light", "judge", "more_blurred"),
 ]
 
 _SAMPLED_GAP = 0.2537  # a sample shows a surface up to this part of the step from it; larger: more samples
 _FALLOFF_PX = 2.5  # standard deviation of the Gaussian weights of samples
 _SURE = (0.0, 0.02, 0.06, 0.2, 1.0)  # weight of a sample, by ring: beside a step its depth may be wrong
-CLEAR = 0.1  # sum of these weights from which samples beside a step count in full; larger: thin strands stay
-CLEAR_IN_PRIOR = 0.25  # the same where the share of wrong pixels is estimated; larger: soft pictures stay
+_CLEAR = 0.1  # sum of these weights from which samples beside a step count in full; larger: thin strands stay
+_CLEAR_IN_PRIOR = 0.25  # the same where the share of wrong pixels is estimated; larger: soft pictures stay
 _LIKELY = 0.01  # likelihood from which a ramp's pixel shows one of both surfaces; larger: more pixels stay between them
 _LEAST_SEEN = 1e-3  # sum of the weights of samples from which a surface is known
 _UNLIKE = 1e-3  # weight of samples that do not resemble a pixel, in the nearness of its surfaces
@@ -79,13 +80,20 @@ class Shown(NamedTuple):
     far: Tensor  # the same of the far surface
 
 
+@kept
+def falloff(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Weights of samples by their distance, as :func:`.windows.gaussian`; a pixel is not its own sample."""
+    weights = gaussian(REACH, _FALLOFF_PX, dtype, device)
+    return torch.where(weights < 1.0, weights, 0.0)
+
+
 def finite_light(image: Tensor, brightest: float = _BRIGHTEST) -> Tensor:
     """Light from 0 to ``brightest``, and 0 where it is not finite."""
     return torch.where(torch.isfinite(image), image, 0.0).clamp(0.0, brightest)
 
 
 def judge(
-    looks: Looks, like: Tensor, edge_pixels: Tensor, sharpness: Tensor, clear: float, mixtures: bool, ops: Ops
+    looks: Looks, like: Tensor, edge_pixels: Tensor, sharpness: Tensor, in_prior: bool, mixtures: bool, ops: Ops
 ) -> Shown:
     """Scores by colour which of two surfaces pixels ``[P]`` show.
 
@@ -103,18 +111,17 @@ def judge(
         like: A map of the frame.
         edge_pixels: Indices of the pixels.
         sharpness: The factor on the scores of each item, ``[B]``.
-        clear: The sum of weights from which samples of a surface count in full.
+        in_prior: Whether more samples are needed for full scores, for the shares of wrong pixels.
         mixtures: Whether step 4 is done.
         ops: Processes the list in parts.
     """
-    falloff = gaussian(REACH, _FALLOFF_PX, like.dtype, like.device)
-    falloff = torch.where(falloff < 1.0, falloff, 0.0)  # a pixel is not its own sample
+    weights, clear = falloff(like.dtype, like.device), _CLEAR_IN_PRIOR if in_prior else _CLEAR
 
     def look(part: Tensor) -> Tensor:
         others, values, trusted = looks.samples(pixels.around(part, like, REACH))
         own, ends, is_ramp = looks.own(part)
         most_off = _SAMPLED_GAP * (ends[0] - ends[1]).clamp_min(1e-12)
-        side = falloff * trusted * ((values - ends[:, None]).abs() < most_off)  # [2, n, P]
+        side = weights * trusted * ((values - ends[:, None]).abs() < most_off)  # [2, n, P]
 
         # mean colours of both surfaces, and the variance around them
         seen = side.sum(1)

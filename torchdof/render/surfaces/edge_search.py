@@ -12,7 +12,7 @@ from torch import Tensor
 from ..rules import active
 from .windows import NEVER, highest, mean_around
 
-__all__ = ["DIRECTIONS", "LEVELS", "PLACES", "REACH", "RINGS", "Edges", "ends_of", "find", "kinds", "noise"]
+__all__ = ["DIRECTIONS", "LEVELS", "PLACES", "RAMP_REACH", "REACH", "RINGS", "Edges", "ends_of", "find", "kinds", "noise"]
 
 REACH = 5  # px; half the width of the window that has both surfaces of an edge, and samples of them
 
@@ -21,7 +21,7 @@ REACH = 5  # px; half the width of the window that has both surfaces of an edge,
 RINGS = 3  # px on each side of a step that are checked; larger: corrects wider displacements
 _ABRUPT = 0.3037  # smallest jump between neighbours at a step, as a fraction of the step; larger: fewer steps
 _FLAT_REACH = 8  # px within which a ramp becomes flat; larger: more slopes count as ramps
-_RAMP_REACH = 6  # px; half the width of the widest ramp, anything wider is a slope
+RAMP_REACH = 6  # px; half the width of the widest ramp, anything wider is a slope
 _LEAST_SLOPE = 0.1  # smallest slope of a ramp per pixel, in smallest steps
 _SHALLOW = 0.0303  # smallest slope of a ramp per pixel, as a fraction of the range of nearness around
 _FLAT = 0.3037  # slope of the flattest place around a ramp, over the ramp's; larger: more slopes count as ramps
@@ -71,7 +71,7 @@ def find(nearness: Tensor, valid: Tensor, step: Tensor) -> Edges:
 
     # the surfaces at both ends of a ramp: extremes spread along it pixel by pixel
     spread = ends
-    for _ in range(_RAMP_REACH):
+    for _ in range(RAMP_REACH):
         spread = torch.where(is_ramp, highest(spread, 1), spread)
     is_ramp = is_ramp & (spread.sum(1, keepdim=True) > step)
     ends = torch.where(is_ramp, spread, ends)

@@ -23,6 +23,7 @@ from ...options import DepthEdges
 from ...tensors import is_differentiated, is_empty, is_traced
 from ...validation import ends, engine_reads
 from ..engines.compiled_steps import by_items
+from ..engines.on_gpu import find_edges, judge
 from ..engines.ops import EAGER, Ops
 from ..engines.traced import is_compiled, one_operator
 from ..layers.convolution import widest_float
@@ -31,14 +32,11 @@ from . import edge_search
 from .coverage import is_near_edge
 from .doubt import blurred_in_doubt, doubt_of
 from .edge_colours import (
-    CLEAR,
-    CLEAR_IN_PRIOR,
     SHARPNESS,
     SOFT_SHARPNESS,
     Looks,
     Shown,
     finite_light,
-    judge,
     more_blurred,
 )
 from .edge_search import DIRECTIONS, LEVELS, PLACES, REACH, RINGS, Edges
@@ -243,7 +241,7 @@ class _Map(NamedTuple):
         valid = nearness.abs() <= LARGEST
         given, light = torch.where(valid, nearness, 0.0), finite_light(image)
         step = torch.maximum(step, _NOISES * edge_search.noise(given, valid))
-        edges = edge_search.find(given, valid, step)
+        edges = find_edges(light, given, valid, step)
         is_near = 2.0 * given > edges.near + edges.far
         is_mixed = edges.is_edge & ((edges.level - 0.5).abs() < 0.25)
         looks = Looks.of(light, given, valid, edges)
@@ -300,7 +298,7 @@ def _repair(
     chosen = pixels.indices(errors.doubtful)
     if auto and is_empty(chosen):  # nor lamps: a soft map has ramps, which are selected
         return nearness, torch.zeros_like(errors.doubt)
-    shown = judge(scene.looks, scene.nearness, chosen, errors.sharpness, CLEAR, of_coc, ops)
+    shown = judge(scene.looks, scene.nearness, chosen, errors.sharpness, False, of_coc, ops)
     shows_near = _decided(scene, errors, shown.score, chosen, auto)
     repaired = _moved(scene, errors, shown, shows_near, chosen)
     if active().ringing:
@@ -327,7 +325,7 @@ def _errors_of(scene: _Map, auto: bool, ops: Ops) -> _Errors:
     sharpness = torch.where(is_soft, SOFT_SHARPNESS, SHARPNESS).flatten().to(dtype)
 
     kind = edge_search.kinds(edges)
-    score = judge(scene.looks, scene.nearness, sampled, sharpness, CLEAR_IN_PRIOR, False, ops).score
+    score = judge(scene.looks, scene.nearness, sampled, sharpness, True, False, ops).score
     weight = (0.5 * score.abs()).clamp(max=1.0)
     prior = _calibrate(pixels.pick(kind, sampled)[0], score, weight, scene.nearness.shape[0])[kind]
     doubt = scene.nearness.new_zeros(scene.nearness.shape[0], 1, 1, 1)
