@@ -3,7 +3,6 @@
 #include <array>
 #include <cmath>
 #include <cstring>
-#include <utility>
 #include <vector>
 
 #include "api.h"
@@ -29,7 +28,14 @@ constexpr int CELLS = TILE / CELL;  // along a side of a tile
 constexpr int RINGS = sizeof(RINGS_PX) / sizeof(RINGS_PX[0]);
 static_assert(TILE % CELL == 0 && TILE % LANES == 0 && MARGIN % LANES == 0 && MARGIN >= RINGS_PX[RINGS - 1], "");
 
-bool is_valid(float coc) { return std::fabs(coc) <= LARGEST_PX; }
+// Distance from the near surface to the middle of each ring; the first value is for pixels without one.
+constexpr float MIDDLES_PX[8] = {0,
+                                 0.5f * RINGS_PX[0],
+                                 0.5f * (RINGS_PX[0] + RINGS_PX[1]),
+                                 0.5f * (RINGS_PX[1] + RINGS_PX[2]),
+                                 0.5f * (RINGS_PX[2] + RINGS_PX[3]),
+                                 0.5f * (RINGS_PX[3] + RINGS_PX[4])};
+static_assert(RINGS == 5, "");
 
 // The least of 2 * reach + 1 values around each of a vector. Two chains of operations, of which processors work on
 // both.
@@ -354,73 +360,35 @@ class Missed : Frame {
     return clamp01((share - MISSED) / (MANY_MISSED - MISSED));
   }
 
-  // Step 5: `ring_` becomes the distance up to which the near surface may grow onto a pixel. Lists these pixels.
-  std::vector<std::pair<int, int>> wanted_pixels(const std::vector<float> &means, float everywhere) {
+  // Step 5: gives the near surface to pixels of rings whose middle is within its growth. Returns whether there are
+  // some.
+  bool grow(const std::vector<float> &means, float everywhere) {
+    memcpy(map_.out, map_.nearness, area_ * sizeof(float));
+    std::vector<uint8_t> has(across_ * down_);
     each_tile([&](int tile) {
       Background of(channels_);
       const auto prepare = [&](int y) {
         read(tile, y, 1);
         read(means, tile, y, of);
       };
-      const auto mark = [&](int j, size_t at) {
+      const auto take = [&](int j, size_t at) {
         const vec smooth = load<vec>(of.is_smooth() + j) * GROWTH_OVER_SMOOTH_PX;
-        store(&ring_[at], known(at, of, j) ? max(smooth, broadcast(everywhere)) : vec{});
+        const vec middle = lookup(MIDDLES_PX, convert(load<vec>(&ring_[at])));
+        const ivec is_taken = known(at, of, j) & (max(smooth, broadcast(everywhere)) > middle);
+        if (!any_of(is_taken)) return;
+        has[tile] = true;
+        float *const out = map_.out + pixel((int)(at / pitch_), (int)(at % pitch_));
+        for (int l = 0; l < LANES; l++)
+          if (is_taken[l]) out[l] = near_[at + l];
       };
-      each_vector(tile, 1, prepare, mark, [](int) {});
+      each_vector(tile, 1, prepare, take, [](int) {});
     });
-    std::vector<std::pair<int, int>> pixels;
-    for (int y = 0; y < height_; y++)
-      for (int x = 0; x < width_; x++)
-        if (ring_[padded(y, x)] > 0) pixels.push_back({y, x});
-    return pixels;
-  }
-
-  // Lets near surfaces grow. Lists of pixels are processed: those beside pixels that the last step has taken.
-  bool grow(const std::vector<float> &means, float everywhere) {
-    std::vector<std::pair<int, int>> wanted = wanted_pixels(means, everywhere), taken;
-    if (wanted.empty()) return false;
-    memcpy(map_.out, map_.nearness, area_ * sizeof(float));
-    bool changed = false;
-    for (int grown = 0; grown < GROWTH_PX && !wanted.empty(); grown += GROWTH_STEP_PX) {
-      taken.clear();
-      for (const auto &[y, x] : wanted) {
-        float &may = ring_[padded(y, x)];
-        may = std::fabs(may);
-        if (!(may > (float)grown)) continue;
-        float nearest = FAR_PX;
-        each_beside(y, x, [&](int v, int u) {
-          const float coc = map_.out[pixel(v, u)];
-          if (is_valid(coc)) nearest = std::min(nearest, coc);
-        });
-        if (!(-nearest > hiding_px(std::fabs(map_.out[pixel(y, x)])))) continue;
-        may = 0;
-        near_[padded(y, x)] = nearest;
-        taken.push_back({y, x});
-      }
-      wanted.clear();
-      for (const auto &[y, x] : taken) map_.out[pixel(y, x)] = near_[padded(y, x)];
-      for (const auto &[y, x] : taken)
-        each_beside(y, x, [&](int v, int u) {
-          float &may = ring_[padded(v, u)];
-          if (!(may > 0)) return;
-          may = -may;  // is listed
-          wanted.push_back({v, u});
-        });
-      changed |= !taken.empty();
-    }
-    return changed;
+    return std::count(has.begin(), has.end(), 1) > 0;
   }
 
   // Index of a pixel in a plane whose rows are padded to whole tiles; index of a cell.
   size_t padded(int y, int x) const { return (size_t)y * pitch_ + x; }
   size_t cell(int y, int x) const { return (size_t)y * columns_ + x; }
-
-  template <typename Visit>
-  void each_beside(int y, int x, const Visit &visit) const {
-    const int reach = GROWTH_STEP_PX;
-    for (int v = std::max(y - reach, 0); v <= std::min(y + reach, height_ - 1); v++)
-      for (int u = std::max(x - reach, 0); u <= std::min(x + reach, width_ - 1); u++) visit(v, u);
-  }
 
   const torchdof_map &map_;
   const int channels_;

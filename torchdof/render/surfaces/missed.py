@@ -44,7 +44,6 @@ _LEAST_LIKE = 0.1  # least share of the background that is taken to be like it
 _COUNTED = 300.0  # compared pixels of a frame at which the share counts by half; larger: small edges count less
 _GROWTH_PX = 22  # px; by which near surfaces grow at most; larger: longer hairs
 _GROWTH_OVER_SMOOTH_PX = 10.0  # px; by which they grow over a smooth background
-_GROWTH_STEP_PX = 2  # px; they grow in steps, each onto pixels that are much less blurred
 _ON_SURFACE = 0.25  # deviation of the coc of samples, over the difference of both surfaces, up to which they are one
 _LEAST_SAMPLES = 0.006  # fraction of the window that samples fill
 _FAR_PX = 1e9  # px; a coc that marks pixels without a near surface
@@ -64,7 +63,8 @@ def completed(image: Tensor, coc_px: Tensor, before: Tensor, ops: Ops = EAGER) -
        ``z^4 / (z^4 + 81)``.
     4. The mean of this in the second and third ring of the whole frame, less that in the last one: ``(inner - outer) /
        (1 - outer)``. From :data:`_MISSED` on, near surfaces grow, at :data:`_MANY_MISSED` by :data:`_GROWTH_PX`.
-    5. Where the background varies by less than :data:`_SMOOTH`, they grow by :data:`_GROWTH_OVER_SMOOTH_PX` at least.
+       Where the background varies by less than :data:`_SMOOTH`, they grow by :data:`_GROWTH_OVER_SMOOTH_PX` at least.
+    5. Rings whose middle is within this growth become the near surface.
 
     Args:
         image: ``[B, C, H, W]``, linear light; its scale does not matter if it is above 1e-8.
@@ -99,9 +99,10 @@ def _completed(image: Tensor, coc_px: Tensor, is_inexact: Tensor, ops: Ops) -> t
     is_valid = (coc_px.abs() <= _LARGEST_PX) & is_inexact[:, None, None, None]
     coc, hiding = torch.where(is_valid, coc_px, 0.0), torch.where(is_valid, hiding_px(coc_px.abs()), _FAR_PX)
     # blur of the near surface, of which each ring takes the largest around it; negative behind the focus
-    surface = values = torch.where(is_valid, -coc_px, -_FAR_PX)
-    near, ring = torch.full_like(coc, -_FAR_PX), torch.zeros_like(coc)
+    values = torch.where(is_valid, -coc_px, -_FAR_PX)
+    near, ring, middles = torch.full_like(coc, -_FAR_PX), torch.zeros_like(coc), [0.0]
     for k, (start_px, end_px) in enumerate(itertools.pairwise((0, *_RINGS_PX)), 1):
+        middles.append(0.5 * (start_px + end_px))
         around = highest(values, end_px - start_px)
         is_new = (ring == 0) & (around > hiding)
         near, ring = torch.where(is_new, around, near), torch.where(is_new, float(k), ring)
@@ -127,15 +128,9 @@ def _completed(image: Tensor, coc_px: Tensor, is_inexact: Tensor, ops: Ops) -> t
     excess = (found / count.clamp_min(1.0) - usual) / (1.0 - usual).clamp_min(_LEAST_LIKE) * count / (count + _COUNTED)
     share = ((excess - _MISSED) / (_MANY_MISSED - _MISSED)).clamp(0.0, 1.0)
     growth = _GROWTH_PX * share
-    growth = torch.where(known, torch.where(is_smooth > 0, growth.clamp_min(_GROWTH_OVER_SMOOTH_PX), growth), 0.0)
-    if not is_traced() and not (growth > 0).any():
-        return coc_px, share
-
-    for grown in range(0, _GROWTH_PX, _GROWTH_STEP_PX):
-        around = highest(surface, _GROWTH_STEP_PX)
-        is_taken = (growth > grown) & (around > hiding)
-        surface, growth = torch.where(is_taken, around, surface), torch.where(is_taken, 0.0, growth)
-    return ops.equal_unless(lambda: has_edges, torch.where(is_valid, -surface, coc_px), coc_px), share
+    growth = torch.where(is_smooth > 0, growth.clamp_min(_GROWTH_OVER_SMOOTH_PX), growth)
+    is_taken = known & (growth > coc.new_tensor(middles)[ring.long()])
+    return ops.equal_unless(lambda: has_edges, torch.where(is_taken, -near, coc_px), coc_px), share
 
 
 def _empty(image: Tensor, coc_px: Tensor, is_inexact: Tensor) -> tuple[Tensor, Tensor]:
