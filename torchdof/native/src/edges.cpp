@@ -285,18 +285,11 @@ class Repair : Planes, EdgeMap {
       return score + prior[edge.kind] + lean * clamp01(std::fabs(score) - 1.0f) +
              (is_soft ? to_blurred * more_blurred(edge.near, edge.far) : 0.0f);
     };
-    std::vector<std::vector<float>> chances(groups.size());
-    for (int round = 0; is_soft && round < DECIDED_ROUNDS; round++) {
+    if (is_soft)  // the chances that pixels show the near surface
       parallel((int)groups.size(), [&](int g) {
-        chances[g].resize(groups[g].edges.size());
-        for (size_t k = 0; k < chances[g].size(); k++)
-          chances[g][k] =
-              1.0f / (1.0f + std::exp(-odds(groups[g], k) - (round ? neighbours(groups[g].edges[k]) : 0.0f)));
+        for (size_t k = 0; k < groups[g].edges.size(); k++)
+          score_[groups[g].edges[k].i] = 1.0f / (1.0f + std::exp(-odds(groups[g], k)));
       });
-      parallel((int)groups.size(), [&](int g) {
-        for (size_t k = 0; k < chances[g].size(); k++) score_[groups[g].edges[k].i] = chances[g][k];
-      });
-    }
     std::vector<int64_t> lost(groups.size(), 0);
     parallel((int)groups.size(), [&](int g) {
       for (size_t k = 0; k < groups[g].edges.size(); k++) {

@@ -71,7 +71,6 @@ _DOUBTFUL = 0.05  # share of wrong pixels of a kind above which these pixels are
 _LEAN = 2.0  # log-odds by which a far surface must win: foreground left behind is the more visible error
 _TO_BLURRED = 3.0  # log-odds for a soft map's near surface that is more blurred; larger: fewer specks, less detail
 _BESIDE, _DIAGONAL = 1.3, 0.8  # log-odds of a neighbour's surface in soft maps; larger: smoother edges, less detail
-_DECIDED_ROUNDS = 4  # times that neighbours decide again; more: smoother edges
 
 # Soft maps: blurred by resampling, or written by a network. More than _SOFT of the edge pixels of a soft map lie on
 # ramps. These are wider than _WIDE, or have more than _MIXED of their pixels in the middle half between both surfaces:
@@ -354,8 +353,8 @@ def _decided(scene: _Map, errors: _Errors, score: Tensor, chosen: Tensor, auto: 
     """Which of the pixels ``[P]`` show the near surface: those where ``score + logit(prior) > 0``.
 
     With ``auto`` a far surface needs a lead. In soft maps the sum also has a term for a more blurred near surface, for
-    a map of the coc, and the chances of the neighbours to show it, which depend on theirs in turn: a mean field of a
-    few rounds, so that edges are smooth lines without single pixels beside them.
+    a map of the coc, and one for the chances of its neighbours to show it, so that edges are smooth lines without single
+    pixels beside them.
     """
     rules, of_soft = active(), scene.of_item(errors.is_soft, chosen)
     odds = score + torch.logit(pixels.pick(errors.prior, chosen)[0])
@@ -364,15 +363,14 @@ def _decided(scene: _Map, errors: _Errors, score: Tensor, chosen: Tensor, auto: 
     surfaces = pixels.pick(scene.looks.ends, chosen)
     if auto and scene.of_coc and rules.more_blurred:
         odds = torch.where(of_soft, odds + _TO_BLURRED * more_blurred(surfaces), odds)
+    if not rules.neighbours:
+        return odds > 0
     # pixels of a soft map that stick out of an edge are mostly background of a similar colour
     window = pixels.around(chosen, scene.nearness, 1)
     by_map = (pixels.pick(scene.nearness, window)[0] > surfaces.mean(0)).to(odds.dtype)
-    together = odds
-    for _ in range(_DECIDED_ROUNDS if rules.neighbours else 0):
-        chance = pixels.put(torch.full_like(scene.nearness, -1.0), chosen, torch.sigmoid(together))
-        chance = pixels.pick(chance, window)[0]
-        chance = torch.where(chance < 0, by_map, chance)
-        together = odds + (_neighbours(odds.dtype, odds.device) * (2.0 * chance - 1.0)).sum(0)
+    chance = pixels.pick(pixels.put(torch.full_like(scene.nearness, -1.0), chosen, torch.sigmoid(odds)), window)[0]
+    chance = torch.where(chance < 0, by_map, chance)
+    together = odds + (_neighbours(odds.dtype, odds.device) * (2.0 * chance - 1.0)).sum(0)
     return torch.where(of_soft, together, odds) > 0
 
 
