@@ -21,8 +21,8 @@ MODULES = (
     "native/__init__",
     *(f"optics/{name}" for name in ("kernel_bank", "placed_kernels", "psf")),
     *(f"render/{name}" for name in ("exposure", "highlights", "pipeline")),
-    *(f"render/surfaces/{name}" for name in ("border", "disocclusion", "doubt", "edge_colours", "edge_search")),
-    *(f"render/surfaces/{name}" for name in ("edges", "emitters", "frame", "matting", "missed")),
+    *(f"render/surfaces/{name}" for name in ("border", "disocclusion", "doubt", "edge_colours", "edge_prior")),
+    *(f"render/surfaces/{name}" for name in ("edge_search", "edges", "emitters", "frame", "matting", "missed")),
     *(f"render/surfaces/{name}" for name in ("soft_maps", "windows")),
     *(f"render/layers/{name}" for name in ("composite", "convolution", "downsampling", "field")),
     *(f"render/layers/{name}" for name in ("layer_cocs", "layer_weights", "plan")),
@@ -30,7 +30,7 @@ MODULES = (
 """Modules whose constants C++ may read; a header and its namespace have the name of their module."""
 
 SINGLE = (
-    *("composite", "disocclusion", "doubt", "edge_colours", "edge_search", "edges"),
+    *("composite", "disocclusion", "doubt", "edge_colours", "edge_prior", "edge_search", "edges"),
     *("emitters", "frame", "highlights", "matting", "missed", "pipeline", "soft_maps", "windows"),
 )
 """Modules whose C++ computes with single precision alone: their constants are ``float``, the others' ``double``."""

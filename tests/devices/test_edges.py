@@ -80,7 +80,7 @@ def test_edges_are_the_plain_engines(channels: int, launched: list[str], monkeyp
 
 
 KERNELS = {
-    *("find_slopes", "smooth_slopes", "find_ramps", "climb_ramps", "find_surfaces", "judge", "decide"),
+    *("find_slopes", "smooth_slopes", "find_ramps", "climb_ramps", "find_surfaces", "judge", "decide", "fit"),
 }
 
 

@@ -1,5 +1,5 @@
-// Finds the edges of maps of depth, and judges their pixels by colour, on a GPU: torchdof/render/surfaces/edge_search.py and
-// edge_colours.py, whose docstrings have the steps. NVRTC compiles this file at first use, with the number CHANNELS defined. Forward
+// Finds the edges of maps of depth, and judges their pixels by colour, on a GPU: torchdof/render/surfaces/edge_search.py,
+// edge_colours.py and edge_prior.py, whose docstrings have the steps. NVRTC compiles this file at first use, with the number CHANNELS defined. Forward
 // only; without shared memory, barriers and atomic operations, as layers.cu.
 //
 //   find_slopes    slope, jump and steepness of each pixel
@@ -9,6 +9,7 @@
 //   find_surfaces  ramps and steps, and their two surfaces
 //   judge          the score of pixels of a list, from samples around them
 //   decide         the mean of scores of like neighbours
+//   fit            the prior of each kind of pixel, from the scores of samples
 #include "constants/windows.h"
 #include "edge_rules.h"
 
@@ -47,10 +48,14 @@ struct Run {
   const float *sharpness;   // of an item, [items]
   float *scores;            // of pixels of the list, as nearness, NaN elsewhere
   float *shown;             // [5, count]
+  const float *sampled;     // scores of samples, in the order of their kinds
+  const long long *starts;  // of each kind among them, [items, PLACES, DIRECTIONS], and their number
+  float *shares;            // by place, [items, PLACES]
+  float *prior;             // by kind, [items, PLACES, DIRECTIONS]
   int height;
   int width;
   int items;
-  int count;
+  int count;     // of pixels; of shares that are fitted
   int turn;      // of the two surfaces that a launch reads
   int is_prior;  // whether the shares of wrong pixels are estimated
   int mixtures;  // whether mixed colours count as a more blurred near surface
@@ -252,4 +257,25 @@ extern "C" __global__ void decide(const __grid_constant__ Run r) {
   float &evidence = r.shown[EVIDENCE * r.count + k];
   evidence = max(torchdof::clamp01(2 * reliability * strongest - 1), evidence);
   r.shown[SCORE * r.count + k] = max(min(score, MOST_SCORE), -MOST_SCORE);
+}
+
+// The prior of a place, from all its kinds; then that of a kind, for which it is assumed.
+extern "C" __global__ void fit(const __grid_constant__ Run r) {
+  const int g = blockIdx.x * BLOCK + threadIdx.x;
+  if (g >= r.count) return;
+  const bool together = r.turn == 0;
+  const int kinds = together ? DIRECTIONS : 1, place = (together ? g : g / DIRECTIONS) % PLACES;
+  const long long first = r.starts[g * kinds], last = r.starts[(g + 1) * kinds];
+  const auto weight_of = [](float score) { return min(0.5f * absolute(score), 1.0f); };
+  double total = 0;
+  for (long long n = first; n < last; n++) total += weight_of(r.sampled[n]);
+  const float assumed = together ? torchdof::assumed_share(place) : r.shares[g / DIRECTIONS];
+  float share = together ? torchdof::first_share(place) : 0.5f;
+  for (int round = 0; round < torchdof::constants::edge_prior::ROUNDS; round++)
+    share = torchdof::next_share(share, total, assumed, [&](float odds) {
+      double near = 0;
+      for (long long n = first; n < last; n++) near += weight_of(r.sampled[n]) / (1 + odds * expf(-r.sampled[n]));
+      return near;
+    });
+  (together ? r.shares : r.prior)[g] = share;
 }

@@ -74,6 +74,32 @@ def find(nearness: Tensor, valid: Tensor, step: Tensor, ramp_reach: int, channel
     return near, far, is_ramp, ring, is_edge, direction, level, climb
 
 
+def calibrate(kinds: Tensor, score: Tensor, items: int, places: int, directions: int, channels: int) -> Tensor:
+    """The prior, as :func:`torchdof.render.surfaces.edge_prior.calibrate`.
+
+    Args:
+        kinds: Kinds of samples ``[P]``: ``(item * places + place) * directions + direction``.
+        score: Scores of the samples.
+        items: Number of items.
+        places: Number of places of an edge pixel.
+        directions: Number of directions of an edge.
+        channels: That of the kernels.
+
+    Returns:
+        The share of each kind, ``[B * places * directions]``.
+    """
+    launch = module(channels, score.device.index or 0)
+    shares, prior = (score.new_empty(items * places * n) for n in (1, directions))
+    kinds, order = kinds.sort(stable=True)
+    starts = torch.searchsorted(kinds, torch.arange(len(prior) + 1, device=kinds.device))
+    maps = {"sampled": score[order], "starts": starts, "shares": shares, "prior": prior}
+    argument = argument_type()(**{name: loader.pointer(values) for name, values in maps.items()})
+    for turn, of_turn in enumerate((shares, prior)):
+        argument.turn, argument.count = turn, len(of_turn)
+        launch("fit", (-(-len(of_turn) // _BLOCK), 1, 1), (_BLOCK, 1, 1), argument)
+    return prior
+
+
 def judge(
     looks: Tensor, like: Tensor, chosen: Tensor, falloff: Tensor, sharpness: Tensor, is_prior: bool, mixtures: bool
 ) -> Tensor:

@@ -1,8 +1,9 @@
-// The rules by which edges of depth are found and their pixels judged, steps of torchdof/render/surfaces/edge_search.py
-// and edge_colours.py. The compiled engine computes vectors V of pixels, the kernels of GPUs (torchdof/kernels) single
-// ones.
+// The rules by which edges of depth are found and their pixels judged, steps of
+// torchdof/render/surfaces/edge_search.py, edge_colours.py and edge_prior.py. The compiled engine computes vectors V of
+// pixels, the kernels of GPUs (torchdof/kernels) single ones.
 #pragma once
 #include "constants/edge_colours.h"
+#include "constants/edge_prior.h"
 #include "constants/edge_search.h"
 #include "numbers.h"
 
@@ -57,6 +58,24 @@ inline V direction(V right, V below, V gap) {
   const V tie = constants::edge_search::TIE * gap;
   return 2.0f * (absolute(below) > absolute(right) + tie ? sign(below) : V{}) +
          (absolute(right) > absolute(below) + tie ? sign(right) : V{});
+}
+
+// The share of the pixels of a place that is assumed to show the near surface, and where its first fit starts.
+inline float assumed_share(int place) {
+  using namespace constants::edge_search;
+  const float trusted = constants::edge_prior::TRUSTED;
+  return place < RINGS ? trusted : place < 2 * RINGS ? 1.0f - trusted : (place - 2 * RINGS + 0.5f) / LEVELS;
+}
+inline float first_share(int place) { return place < 2 * constants::edge_search::RINGS ? 0.5f : assumed_share(place); }
+
+// A round of the fit of a share. near_of(odds): the pixels that show the near surface, by these odds of the far one.
+// total: of the pixels.
+template <typename NearOf>
+inline float next_share(float share, double total, float assumed, const NearOf &near_of) {
+  using namespace constants::edge_prior;
+  const double near = near_of((1.0f - share) / share);
+  const float next = (float)((near + PRIOR_COUNT * assumed) / (total + PRIOR_COUNT));
+  return min(max(next, 1.0f - MOST_SHARE), MOST_SHARE);
 }
 
 // How clearly the near one of two surfaces is the more blurred one, 0 to 1.

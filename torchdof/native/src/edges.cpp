@@ -8,6 +8,7 @@
 #include "api.h"
 #include "constants/doubt.h"
 #include "constants/edge_colours.h"
+#include "constants/edge_prior.h"
 #include "constants/edges.h"
 #include "edge_colours.h"
 #include "edge_rules.h"
@@ -21,6 +22,7 @@
 namespace torchdof {
 namespace {
 
+using namespace constants::edge_prior;
 using namespace constants::edges;  // render/surfaces/edges.py gives meanings, units and effects
 using constants::doubt::ASSUMED, constants::doubt::CONTRADICTED, constants::doubt::OFTEN_CONTRADICTED;
 using constants::edge_colours::SHARPNESS, constants::edge_colours::SOFT_SHARPNESS;
@@ -222,8 +224,8 @@ class Repair : Planes, EdgeMap {
   void calibrate(const std::vector<Group> &groups) {
     std::vector<float> assumed(PLACES), start(PLACES);
     for (int p = 0; p < PLACES; p++) {
-      assumed[p] = p < RINGS ? TRUSTED : p < 2 * RINGS ? 1.0f - TRUSTED : (p - 2 * RINGS + 0.5f) / LEVELS;
-      start[p] = p < 2 * RINGS ? 0.5f : assumed[p];
+      assumed[p] = assumed_share(p);
+      start[p] = first_share(p);
     }
     std::vector<Observations> observations(KINDS);
     for (const Group &group : groups)
@@ -262,13 +264,10 @@ class Repair : Planes, EdgeMap {
     };
     for (size_t g = 0; g < share.size(); g++) {
       const double total = sum_of(g * together, [](vec weight, vec) { return weight; });
-      for (int round = 0; round < ROUNDS; round++) {
-        const float odds = (1.0f - share[g]) / share[g];
-        const double found =
-            sum_of(g * together, [&](vec weight, vec other) { return weight / (1.0f + odds * other); });
-        share[g] = std::clamp((float)((found + PRIOR_COUNT * assumed[g]) / (total + PRIOR_COUNT)), 1.0f - MOST_SHARE,
-                              MOST_SHARE);
-      }
+      for (int round = 0; round < ROUNDS; round++)
+        share[g] = next_share(share[g], total, assumed[g], [&](float odds) {
+          return sum_of(g * together, [&](vec weight, vec other) { return weight / (1.0f + odds * other); });
+        });
     }
     return share;
   }

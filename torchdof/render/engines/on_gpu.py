@@ -19,7 +19,7 @@ from ... import native
 from ...kernels import edges, layers, matting
 from ...tensors import is_differentiated, is_in_memory, is_traced, without_autocast
 from ..layers.layer_weights import ramps
-from ..surfaces import edge_colours, edge_search
+from ..surfaces import edge_colours, edge_prior, edge_search
 from ..surfaces.edge_colours import Looks, Shown
 from ..surfaces.edge_search import Edges
 from ..surfaces.frame import PaddedFrame, PaddedSurface, maps_of, surfaces_of
@@ -101,11 +101,22 @@ def judge(
     return _judged_by_kernels(looks, like, edge_pixels, sharpness, in_prior, mixtures)
 
 
+def calibrate(light: Tensor, kinds: Tensor, score: Tensor) -> Tensor:
+    """:func:`torchdof.render.surfaces.edge_prior.calibrate` for images ``[B, C, H, W]``, by kernels of a GPU.
+
+    Raises:
+        ValueError: If they cannot be used and ``TORCHDOF_ENGINE`` is ``gpu``.
+    """
+    if _has_no_edge_kernels(light, score):
+        return edge_prior.calibrate(kinds, score, light.shape[0])
+    return _calibrated_by_kernels(light, kinds, score)
+
+
 def _has_no_edge_kernels(light: Tensor, like: Tensor) -> bool:
     """Whether PyTorch finds and judges edges, for light ``[B, C, ...]`` and a map of the frame."""
     channels = light.shape[1]
     # the number of items after `takes`, as in `composited`
-    is_taken = takes([light, like], channels, 1) and len(like) <= edges.MOST_ITEMS
+    is_taken = takes([light, like], channels, 1) and len(light) <= edges.MOST_ITEMS
     return not is_taken or _missing(_edges_of_trial, channels, like.device.index or 0)
 
 
@@ -217,28 +228,33 @@ def _edges_of_trial(channels: int, device: int) -> Any:
     nearness[..., 18:, :] = mean_around(nearness, 2)[..., 18:, :]
     light = (light + 0.3 * torch.rand(light.shape, generator=dice)) / 1.3
 
-    def shown(find: Callable[..., Edges], decide: Callable[..., Shown], light: Tensor, nearness: Tensor) -> Tensor:
+    def shown(find: Any, decide: Any, learn: Any, light: Tensor, nearness: Tensor) -> Tensor:
         valid, every = nearness > -1e6, torch.arange(nearness.numel(), device=nearness.device)
         found = find(light, nearness, valid, torch.full_like(nearness, 1.0))
         found = found._replace(direction=found.direction * found.is_edge)  # elsewhere it has no meaning
         looks = Looks.of(light, nearness, valid, found)
         judged = [decide(looks, nearness, every, nearness.new_tensor([0.5]), *flags) for flags in _FLAGS_OF_TRIAL]
-        maps = [*found, *(values.view_as(nearness) for each in judged for values in each)]
+        kinds = edge_search.kinds(found).flatten()
+        prior = learn(light, kinds, judged[0].score)[kinds]
+        maps = [*found, *(values.view_as(nearness) for values in (*judged[0], *judged[1], prior))]
         return 0.1 * torch.cat([values.detach().to(nearness.dtype) for values in maps], 1)  # 0 to 1, about
 
-    def plain(*judged: Any) -> Shown:
-        return edge_colours.judge(*judged, EAGER)
-
-    return (
-        [light, 8.0 * nearness],
-        functools.partial(shown, lambda light, *maps: edge_search.find(*maps), plain),
-        functools.partial(shown, _edges_by_kernels, _judged_by_kernels),
+    plain = (
+        lambda light, *maps: edge_search.find(*maps),
+        lambda *judged: edge_colours.judge(*judged, EAGER),
+        lambda light, kinds, score: edge_prior.calibrate(kinds, score, 1),
     )
+    by_kernels = (_edges_by_kernels, _judged_by_kernels, _calibrated_by_kernels)
+    return [light, 8.0 * nearness], *(functools.partial(shown, *steps) for steps in (plain, by_kernels))
 
 
 def _edges_by_kernels(light: Tensor, nearness: Tensor, valid: Tensor, step: Tensor) -> Edges:
     maps = (nearness.contiguous(), valid.contiguous(), step.expand_as(nearness).contiguous())
     return Edges(*edges.find(*maps, edge_search.RAMP_REACH, light.shape[1]))
+
+
+def _calibrated_by_kernels(light: Tensor, kinds: Tensor, score: Tensor) -> Tensor:
+    return edges.calibrate(kinds, score, len(light), edge_search.PLACES, edge_search.DIRECTIONS, light.shape[1])
 
 
 def _judged_by_kernels(

@@ -46,7 +46,7 @@ class Looks(NamedTuple):
     @classmethod
     def of(cls, light: Tensor, nearness: Tensor, valid: Tensor, edges: Edges) -> "Looks":
         """From maps ``[B, C, H, W]`` of light and ``[B, 1, H, W]`` of the others."""
-        weight = nearness.new_tensor(_SURE)[edges.ring] * (valid & ~edges.is_ramp)
+        weight = _sure(nearness.dtype, nearness.device)[edges.ring] * (valid & ~edges.is_ramp)
         maps = [light.sqrt(), nearness, weight, edges.near, edges.far, edges.is_ramp.to(nearness.dtype)]
         return cls(pixels.rows(torch.cat(maps, 1)))
 
@@ -78,6 +78,12 @@ class Shown(NamedTuple):
     evidence: Tensor  # 0 to 1, that the pixel shows one of both, not a third one between them, such as a lamp
     near: Tensor  # nearness of the near surface, as the mean of the samples that resemble the pixel
     far: Tensor  # the same of the far surface
+
+
+@kept
+def _sure(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """:data:`_SURE`, made once for a device."""
+    return torch.tensor(_SURE, dtype=dtype, device=device)
 
 
 @kept

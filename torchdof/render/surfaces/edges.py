@@ -23,7 +23,7 @@ from ...options import DepthEdges
 from ...tensors import is_differentiated, is_empty, is_traced
 from ...validation import ends, engine_reads
 from ..engines.compiled_steps import by_items
-from ..engines.on_gpu import find_edges, judge
+from ..engines.on_gpu import calibrate, find_edges, judge
 from ..engines.ops import EAGER, Ops
 from ..engines.traced import is_compiled, one_operator
 from ..layers.convolution import widest_float
@@ -39,7 +39,8 @@ from .edge_colours import (
     finite_light,
     more_blurred,
 )
-from .edge_search import DIRECTIONS, LEVELS, PLACES, REACH, RINGS, Edges
+from .edge_prior import PRIOR_COUNT, weight_of
+from .edge_search import REACH, RINGS, Edges
 from .missed import completed
 from .soft_maps import Softness, lift_lamps, sigma_of, without_ringing
 from .windows import LARGEST, highest
@@ -56,12 +57,6 @@ _NOISES = 12.0  # smallest step, in standard deviations of the noise; larger: fe
 # Sample of the frame, from which the errors of its map are learnt
 _SAMPLED = 12_000  # sqrt(_SAMPLED * pixels of the frame) pixels are sampled, in blocks; larger: more exact, slower
 _BLOCK = 8  # px; side of a block
-
-# Prior: how often each kind of edge pixel shows the near surface
-_TRUSTED = 0.05  # assumed share of wrong pixels beside steps
-_PRIOR_COUNT = 30.0  # weight of assumptions, in pixels; larger: the frame changes them less
-_ROUNDS = 10  # iterations of the fit
-_MOST_SHARE = 0.995  # largest share of one surface
 
 # Decision, with "auto"
 _CLEAR_LEVEL = 0.3  # distance from the middle of a ramp, in steps, from which its pixels are clear
@@ -325,8 +320,7 @@ def _errors_of(scene: _Map, auto: bool, ops: Ops) -> _Errors:
 
     kind = edge_search.kinds(edges)
     score = judge(scene.looks, scene.nearness, sampled, sharpness, True, False, ops).score
-    weight = (0.5 * score.abs()).clamp(max=1.0)
-    prior = _calibrate(pixels.pick(kind, sampled)[0], score, weight, scene.nearness.shape[0])[kind]
+    prior = calibrate(scene.light, pixels.pick(kind, sampled)[0], score)[kind]
     doubt = scene.nearness.new_zeros(scene.nearness.shape[0], 1, 1, 1)
     if not auto:
         return _Errors(is_soft, sharpness, prior, edges.is_edge, doubt)
@@ -334,12 +328,12 @@ def _errors_of(scene: _Map, auto: bool, ops: Ops) -> _Errors:
     # colour agrees with the map at clear pixels: in the outermost ring of a step, or near a ramp's ends; on one side of
     # the edges only where the map's foreground is too thin, and at half of them where it has no relation
     wrong = torch.where(scene.is_near, 1.0 - prior, prior)
-    weight = weight * torch.where(is_ramp > 0, (level - 0.5).abs() > _CLEAR_LEVEL, ring == RINGS)
+    weight = weight_of(score) * torch.where(is_ramp > 0, (level - 0.5).abs() > _CLEAR_LEVEL, ring == RINGS)
     is_clear = weight * torch.stack([level > 0.5, level <= 0.5])  # of the near and of the far surface
     agrees = is_clear * ((score > 0) == (level > 0.5))
     doubts, *sides = scene.sums(sampled, (1.0 - is_ramp) * pixels.pick(wrong, sampled)[0], *is_clear, *agrees)
     clear, agreed = torch.stack(sides).chunk(2)
-    assumed = 0.5 * _PRIOR_COUNT  # pixels, half of which agree
+    assumed = 0.5 * PRIOR_COUNT  # pixels, half of which agree
     is_related = (agreed + 0.5 * assumed > _RELATED * (clear + assumed)).any(0)
     is_soft = is_soft & is_related
     is_inexact = is_related & (is_soft | (doubts > _EXACT * steps))
@@ -382,37 +376,6 @@ def _moved(scene: _Map, errors: _Errors, shown: Shown, shows_near: Tensor, chose
         evidence = torch.ones_like(evidence)
     moved = torch.where(is_ramp, evidence, (shows_near != was_near).to(own.dtype))
     return pixels.put(scene.nearness, chosen, torch.lerp(own, torch.where(shows_near, shown.near, shown.far), moved))
-
-
-def _calibrate(kinds: Tensor, score: Tensor, weight: Tensor, items: int) -> Tensor:
-    """Share of pixels that show the near surface, for each kind: the prior, fitted to colour scores of samples ``[P]``.
-
-    Expectation maximisation with an assumed share, which counts as :data:`_PRIOR_COUNT` pixels. The first fit joins all
-    directions; its shares are the assumption of the second fit, one direction at a time.
-    """
-    device, dtype = score.device, score.dtype
-    steps = torch.tensor([_TRUSTED] * RINGS + [1.0 - _TRUSTED] * RINGS, device=device, dtype=dtype)
-    ramps = (torch.arange(LEVELS, device=device, dtype=dtype) + 0.5) / LEVELS
-    assumed = torch.cat([steps, ramps]).repeat(items)
-    odds = torch.exp(-score)
-
-    def fit(groups: Tensor, start: Tensor, assumed: Tensor) -> Tensor:
-        total = torch.full_like(assumed, _PRIOR_COUNT).index_add(0, groups, weight)
-        prior, share = _PRIOR_COUNT * assumed / total, start
-        # of a pixel that counts w of all, w sigmoid(score + logit(share)) = share / (share / w + (1 - share) odds / w)
-        near = total[groups] / weight.clamp_min(1e-20)
-        far = near * odds
-        change = near - far
-        for _ in range(_ROUNDS):
-            own = share[groups]
-            share = prior.index_add(0, groups, own / torch.addcmul(far, own, change))
-            share = share.clamp(1.0 - _MOST_SHARE, _MOST_SHARE)
-        return share
-
-    is_step = (torch.arange(PLACES, device=device) < 2 * RINGS).repeat(items)
-    places = kinds // DIRECTIONS
-    together = fit(places, torch.where(is_step, 0.5, assumed), assumed).repeat_interleave(DIRECTIONS)
-    return fit(kinds, torch.full_like(together, 0.5), together)
 
 
 @kept

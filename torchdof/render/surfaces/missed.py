@@ -16,6 +16,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from ... import native
+from ...optics.kernel_cache import kept
 from ...tensors import is_traced
 from ...validation import engine_reads
 from ..engines.compiled_steps import by_items
@@ -100,9 +101,8 @@ def _completed(image: Tensor, coc_px: Tensor, is_inexact: Tensor, ops: Ops) -> t
     coc, hiding = torch.where(is_valid, coc_px, 0.0), torch.where(is_valid, hiding_px(coc_px.abs()), _FAR_PX)
     # blur of the near surface, of which each ring takes the largest around it; negative behind the focus
     values = torch.where(is_valid, -coc_px, -_FAR_PX)
-    near, ring, middles = torch.full_like(coc, -_FAR_PX), torch.zeros_like(coc), [0.0]
+    near, ring = torch.full_like(coc, -_FAR_PX), torch.zeros_like(coc)
     for k, (start_px, end_px) in enumerate(itertools.pairwise((0, *_RINGS_PX)), 1):
-        middles.append(0.5 * (start_px + end_px))
         around = highest(values, end_px - start_px)
         is_new = (ring == 0) & (around > hiding)
         near, ring = torch.where(is_new, around, near), torch.where(is_new, float(k), ring)
@@ -129,8 +129,15 @@ def _completed(image: Tensor, coc_px: Tensor, is_inexact: Tensor, ops: Ops) -> t
     share = ((excess - _MISSED) / (_MANY_MISSED - _MISSED)).clamp(0.0, 1.0)
     growth = _GROWTH_PX * share
     growth = torch.where(is_smooth > 0, growth.clamp_min(_GROWTH_OVER_SMOOTH_PX), growth)
-    is_taken = known & (growth > coc.new_tensor(middles)[ring.long()])
+    is_taken = known & (growth > _middles_px(coc.dtype, coc.device)[ring.long()])
     return ops.equal_unless(lambda: has_edges, torch.where(is_taken, -near, coc_px), coc_px), share
+
+
+@kept
+def _middles_px(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Distance from the near surface to the middle of each ring; the first value is for pixels without one."""
+    middles = (0.5 * (start_px + end_px) for start_px, end_px in itertools.pairwise((0, *_RINGS_PX)))
+    return torch.tensor([0.0, *middles], dtype=dtype, device=device)
 
 
 def _empty(image: Tensor, coc_px: Tensor, is_inexact: Tensor) -> tuple[Tensor, Tensor]:
