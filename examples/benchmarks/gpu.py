@@ -86,9 +86,13 @@ class Scatter(ctypes.Structure):
 
 
 class Launches:
-    """Counts the launches of the kernels, and what each costs: measured on a device, otherwise by the model."""
+    """Counts the launches of the kernels, and what each costs: measured on a device, otherwise by the model.
 
-    def __init__(self) -> None:
+    The operations of the model are not counted among those of ``counted``.
+    """
+
+    def __init__(self, counted: Counted) -> None:
+        self._operations = counted
         self.count: collections.Counter[str] = collections.Counter()
         self.bytes: dict[str, float] = collections.defaultdict(float)
         self.ms: dict[str, float] = collections.defaultdict(float)
@@ -122,7 +126,9 @@ class Launches:
                 return
             if kernel not in LAYERS_OF_THE_MODEL:
                 launch(kernel, grid, block, argument)
+            before = self._operations.operations
             moved, operations = cost_of(kernel, argument, grid[2])
+            self._operations.operations = before
             self.bytes[kernel] += moved
             self.ms[kernel] += 1e3 * max(LAUNCH_S, moved / BYTES_PER_S, operations / FLOPS)
 
@@ -318,7 +324,7 @@ def costs(ends: float) -> None:
             if HAS_DEVICE:
                 found = [measured(selected, call, light, coc_px) for selected in ("gpu", "torch")]
                 print(f"{name}, a {kind}: {found[0]}; without kernels {found[1]}", flush=True)
-            with Launches() as launches, Counted() as counted:
+            with Counted() as counted, Launches(counted) as launches:
                 call(light, coc_px)
             launches.show(f"{name}, edges, matting and layers of a {kind}")
             with engine("torch"), Counted() as plain:

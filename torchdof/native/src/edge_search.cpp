@@ -253,7 +253,7 @@ class Search : EdgeMap {
   // Kinds of LANES edge pixels. level: nearness, from 0 at the far surface to 1 at the near one; unsure: RINGS less the
   // ring.
   static ivec kinds_at(const Maps &m, int y, int x, vec gap, vec level, vec is_ramp, vec unsure) {
-    const vec none = {}, one = broadcast(1.0f);
+    const vec none = {};
     const vec right = load<vec>(m.high.at(y, x + 2)) - load<vec>(m.high.at(y, x - 2));
     const vec below = load<vec>(m.high.at(y + 2, x)) - load<vec>(m.high.at(y - 2, x));
     const ivec of_level = convert(min(max(level * (float)LEVELS, none), broadcast(LEVELS - 1.0f)));

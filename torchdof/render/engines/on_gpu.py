@@ -1,5 +1,7 @@
-"""Steps of the picture on a CUDA device, by the kernels of :mod:`torchdof.kernels`: matting and layers, forward and
-backward, and the search for edges of depth.
+"""Steps of the picture on a CUDA device, by the kernels of :mod:`torchdof.kernels`.
+
+They find and judge the edges of depth, split mixed pixels, and blur and composite the layers, the latter two with their
+gradients.
 
 Before a device first uses some kernels, they and the plain engine compute a small frame. If the results or the
 gradients differ, or if the kernels cannot be compiled, the plain engine is used from then on, with one warning that
@@ -241,7 +243,7 @@ def _edges_of_trial(channels: int, device: int) -> Any:
 
     plain = (
         lambda light, *maps: edge_search.find(*maps),
-        lambda *judged: edge_colours.judge(*judged, EAGER),
+        functools.partial(edge_colours.judge, ops=EAGER),
         lambda light, kinds, score: edge_prior.calibrate(kinds, score, 1),
     )
     by_kernels = (_edges_by_kernels, _judged_by_kernels, _calibrated_by_kernels)

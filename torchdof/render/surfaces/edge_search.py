@@ -12,7 +12,10 @@ from torch import Tensor
 from ..rules import active
 from .windows import NEVER, highest, mean_around
 
-__all__ = ["DIRECTIONS", "LEVELS", "PLACES", "RAMP_REACH", "REACH", "RINGS", "Edges", "ends_of", "find", "kinds", "noise"]
+__all__ = [
+    *("DIRECTIONS", "LEVELS", "PLACES", "RAMP_REACH", "REACH", "RINGS"),
+    *("Edges", "ends_of", "find", "kinds", "noise"),
+]
 
 REACH = 5  # px; half the width of the window that has both surfaces of an edge, and samples of them
 

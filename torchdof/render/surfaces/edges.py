@@ -347,8 +347,8 @@ def _decided(scene: _Map, errors: _Errors, score: Tensor, chosen: Tensor, auto: 
     """Which of the pixels ``[P]`` show the near surface: those where ``score + logit(prior) > 0``.
 
     With ``auto`` a far surface needs a lead. In soft maps the sum also has a term for a more blurred near surface, for
-    a map of the coc, and one for the chances of its neighbours to show it, so that edges are smooth lines without single
-    pixels beside them.
+    a map of the coc, and one for the chances of its neighbours to show it, so that edges are smooth lines without
+    single pixels beside them.
     """
     rules, of_soft = active(), scene.of_item(errors.is_soft, chosen)
     odds = score + torch.logit(pixels.pick(errors.prior, chosen)[0])
