@@ -33,6 +33,7 @@ from examples.benchmarks.steps import Counted, crops
 from torchdof import blur_by_coc, native
 from torchdof.functional import splat
 from torchdof.kernels import edges, layers, loader, matting
+from torchdof.render import highlights
 from torchdof.render.engines import on_gpu
 
 HAS_DEVICE = torch.cuda.is_available()
@@ -257,6 +258,7 @@ def on_cpu() -> None:
     layers.module, matting.module = on_cpu.layers_module, on_cpu.matting_module  # type: ignore[assignment]
     edges.module = on_cpu.edges_module  # type: ignore[assignment]
     native._library = lambda: (None, "switched off")  # as on a device: all else by PyTorch, items together
+    highlights._PAIR_TAPS = highlights._PAIR_TAPS_GPU
 
 
 def scene(size: tuple[int, int, int], radius_px: float, focus: float = 0.4) -> tuple[str, Tensor, Tensor]:
