@@ -13,7 +13,9 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from torchdof.kernels import edges, layers, loader, matting
 
@@ -115,3 +117,13 @@ def matting_module(channels: int, device: int = 0) -> loader.Launch:
 def edges_module(channels: int, device: int = 0) -> loader.Launch:
     """As :func:`torchdof.kernels.edges.module`, with that driver."""
     return _module("edges.cu", "-O3", *edges.options(channels))
+
+
+def without(wrong: str, module: Callable[..., loader.Launch]) -> Callable[..., loader.Launch]:
+    """A module of which one kernel is not launched, as on a device on which it fails."""
+
+    def other(*variant: Any) -> loader.Launch:
+        launch = module(*variant)
+        return lambda kernel, *arguments: None if kernel == wrong else launch(kernel, *arguments)
+
+    return other

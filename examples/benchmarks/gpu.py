@@ -256,7 +256,7 @@ def on_cpu() -> None:
 
     on_gpu.DEVICE = "cpu"
     layers.module, matting.module = on_cpu.layers_module, on_cpu.matting_module  # type: ignore[assignment]
-    edges.module = on_cpu.edges_module  # type: ignore[assignment]
+    edges.module = on_cpu.edges_module
     native._library = lambda: (None, "switched off")  # as on a device: all else by PyTorch, items together
     highlights._PAIR_TAPS = highlights._PAIR_TAPS_GPU
 

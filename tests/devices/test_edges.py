@@ -7,11 +7,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests import on_cpu
 from torchdof import blur_by_coc, native
 from torchdof.kernels import edges as kernels
-from torchdof.kernels import loader
 from torchdof.render import rules
-from torchdof.render.engines import on_gpu
 from torchdof.render.surfaces import edges
 from torchdof.render.surfaces.windows import mean_around
 
@@ -20,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("no_compiled_engine")
 
 @pytest.fixture
 def no_compiled_engine(launched: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """On the CPU it would repair edges; on a device there is none."""
+    """It would repair the edges of maps on the CPU; those of a device it does not read."""
     monkeypatch.setattr(native, "_library", lambda: (None, "switched off"))
 
 
@@ -155,14 +154,7 @@ def test_where_kernels_do_not_find_edges_the_plain_engine_does(launched: list[st
 def test_kernels_that_find_other_edges_are_not_used(
     wrong: str, launched: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In the trial one kernel is not launched, as on a device on which it fails."""
-    right = kernels.module
-
-    def module(*variant: Any) -> loader.Launch:
-        launch = right(*variant)
-        return lambda kernel, *arguments: None if kernel == wrong else launch(kernel, *arguments)
-
-    monkeypatch.setattr(kernels, "module", module)
+    monkeypatch.setattr(kernels, "module", on_cpu.without(wrong, kernels.module))
     monkeypatch.setenv("TORCHDOF_ENGINE", "auto")
     given = scene(2)
     torch.use_deterministic_algorithms(True)  # new memory is NaN instead of what the last frame left
@@ -174,4 +166,3 @@ def test_kernels_that_find_other_edges_are_not_used(
     launched.clear()
     blur_by_coc(*given)
     assert launched and not KERNELS & {*launched}
-    assert on_gpu.why_missing.cache_info().currsize

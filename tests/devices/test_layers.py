@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests import on_cpu
 from tests.scenes import CAMERA, CASES, Case, assert_same_picture, post_before_lamps, random_scene
 from torchdof import BlurTable, DepthOfField, blur_by_coc
 from torchdof.kernels import edges, layers, loader, matting
@@ -245,14 +246,7 @@ def test_without_kernels_there_is_one_warning_and_the_plain_engines_picture(
 def test_kernels_that_compute_something_else_are_not_used(
     of: Any, wrong: str, first: str, launched: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In the trial one kernel is not launched, as on a device on which it fails."""
-    right = of.module
-
-    def module(*variant: Any) -> loader.Launch:
-        launch = right(*variant)
-        return lambda kernel, *arguments: None if kernel == wrong else launch(kernel, *arguments)
-
-    monkeypatch.setattr(of, "module", module)
+    monkeypatch.setattr(of, "module", on_cpu.without(wrong, of.module))
     monkeypatch.setenv("TORCHDOF_ENGINE", "auto")
     with pytest.warns(RuntimeWarning, match="on this device they render another picture than PyTorch"):
         rendered()

@@ -10,24 +10,14 @@ import torch
 from torch import Tensor
 
 from . import loader
-from .loader import Launch
 
 MOST_CHANNELS, MOST_ITEMS = 8, 4000
 
-_TILE_ROWS, _TILE_COLUMNS = 4, 32  # as in pixel.h
 _BLOCK = 128  # threads of a block for a list of pixels, as in edges.cu
 _WORK = 9  # planes of the work, as in edges.cu
 
 
-@functools.cache
-def module(channels: int, device: int) -> Launch:
-    """The kernels for light of a number of channels, compiled for a CUDA device."""
-    return loader.on_device(loader.text("edges.cu"), options(channels), device)
-
-
-def options(channels: int) -> list[str]:
-    """The compiler's options for the kernels of :func:`module`."""
-    return [f"-DCHANNELS={channels}"]
+module, options = loader.by_channels("edges.cu"), loader.options
 
 
 @functools.cache
@@ -66,9 +56,8 @@ def find(nearness: Tensor, valid: Tensor, step: Tensor, ramp_reach: int, channel
     given = {"nearness": nearness, "valid": valid, "step": step, "work": work}
     found = {"edges": edges, "is_ramp": is_ramp, "is_edge": is_edge, "ring": ring, "direction": direction}
     argument = _argument(nearness, {**given, **found})
-    grid = (-(-width // _TILE_COLUMNS), -(-height // _TILE_ROWS), items)
     for kernel in ("find_slopes", "smooth_slopes", "find_ramps", *["climb_ramps"] * ramp_reach, "find_surfaces"):
-        launch(kernel, grid, (_TILE_COLUMNS, _TILE_ROWS, 1), argument)
+        launch(kernel, *loader.frame_grid(nearness), argument)
         argument.turn ^= kernel == "climb_ramps"
     near, far, level, climb = edges.split(1, 1)
     return near, far, is_ramp, ring, is_edge, direction, level, climb

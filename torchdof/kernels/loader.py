@@ -33,6 +33,7 @@ HEADERS = (
 _NO_STANDARD_LIBRARY = {"cstdint": "typedef long long int64_t;\ntypedef unsigned int uint32_t;\n"}
 _OPTIONS = ("--std=c++17", "--device-as-default-execution-space")
 
+_TILE_ROWS, TILE_COLUMNS = 4, 32  # of a block of threads, as in pixel.h
 
 Launch = Callable[[str, Sequence[int], Sequence[int], ctypes.Structure], None]
 """``launch(kernel, grid, block, argument)``."""
@@ -60,6 +61,22 @@ def structure(source: str, sizes: dict[str, int]) -> type[ctypes.Structure]:
 def pointer(values: Tensor | None) -> int | None:
     """The address of a tensor's memory, for a member of the structure; None for None."""
     return None if values is None else values.data_ptr()
+
+
+def options(channels: int) -> list[str]:
+    """The compiler's options for the kernels of :func:`by_channels`."""
+    return [f"-DCHANNELS={channels}"]
+
+
+def by_channels(source: str) -> Callable[[int, int], Launch]:
+    """``module(channels, device)``: the kernels of a source for light of some channels, compiled for a CUDA device."""
+    return functools.cache(lambda channels, device: on_device(text(source), options(channels), device))
+
+
+def frame_grid(like: Tensor) -> tuple[tuple[int, int, int], tuple[int, int, int]]:
+    """Grid and block of a launch with a thread for each pixel of a map ``[B, ..., H, W]``, as ``pixel.h`` reads it."""
+    height, width = like.shape[-2:]
+    return (-(-width // TILE_COLUMNS), -(-height // _TILE_ROWS), len(like)), (TILE_COLUMNS, _TILE_ROWS, 1)
 
 
 def _candidates(version: str) -> Iterator[str]:

@@ -14,19 +14,10 @@ from .loader import Launch
 
 MOST_CHANNELS, MOST_ITEMS = 8, 4000
 
-_TILE_ROWS, _TILE_COLUMNS = 4, 32  # as in matting.h
 _TAPS = 9  # pixels around one, as in matting.h
 
 
-@functools.cache
-def module(channels: int, device: int) -> Launch:
-    """The kernels for light of a number of channels, compiled for a CUDA device."""
-    return loader.on_device(loader.text("matting.cu"), options(channels), device)
-
-
-def options(channels: int) -> list[str]:
-    """The compiler's options for the kernels of :func:`module`."""
-    return [f"-DCHANNELS={channels}"]
+module, options = loader.by_channels("matting.cu"), loader.options
 
 
 @functools.cache
@@ -91,8 +82,8 @@ class Matting:
         of_rows = self._light.new_empty(len(self._light), 4 * channels, self._light.shape[2])
         self._set(slots=slots, parts=parts, of_rows=of_rows)
         self._run("split_back")
-        grid = (-(-self._light.shape[2] // _TILE_COLUMNS), channels, len(self._light))
-        self._launch("sum_rows", grid, (_TILE_COLUMNS, 1, 1), self._common)
+        grid = (-(-self._light.shape[2] // loader.TILE_COLUMNS), channels, len(self._light))
+        self._launch("sum_rows", grid, (loader.TILE_COLUMNS, 1, 1), self._common)
         of_ends = of_rows.sum(2)
         self._set(of_ends=of_ends)
         self._gather(0, 2 * channels + 2)
@@ -124,6 +115,4 @@ class Matting:
             setattr(self._common, name, loader.pointer(values))
 
     def _run(self, kernel: str) -> None:
-        height, width = self._light.shape[2:]
-        grid = (-(-width // _TILE_COLUMNS), -(-height // _TILE_ROWS), len(self._light))
-        self._launch(kernel, grid, (_TILE_COLUMNS, _TILE_ROWS, 1), self._common)
+        self._launch(kernel, *loader.frame_grid(self._light), self._common)

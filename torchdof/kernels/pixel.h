@@ -2,7 +2,7 @@
 #pragma once
 #include "numbers.h"
 
-constexpr int TILE_ROWS = 4, TILE_COLUMNS = 32;  // of a block of threads, as in matting.py and edges.py
+constexpr int TILE_ROWS = 4, TILE_COLUMNS = 32;  // of a block of threads, as in loader.py
 
 struct Pixel {
   int item, y, x;

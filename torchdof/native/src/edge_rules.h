@@ -28,8 +28,8 @@ struct Extremes {
   V near, far, jump;
 };
 
-// The step beside a pixel: the nearness of both sides, that of the far one negated; and how many rings the step is
-// nearer than the farthest one that counts, 0 if there is none.
+// The step beside a pixel: the nearness of both sides, that of the far one negated; and RINGS + 1 less its ring, 0
+// without a step.
 template <typename V>
 struct Step {
   V near, far, unsure;
@@ -84,7 +84,7 @@ inline V more_blurred(V near, V far) {
   return clamp01((absolute(near) - absolute(far)) / constants::edge_colours::MORE_BLURRED_PX);
 }
 
-// How well colours tell the two surfaces of an edge apart, from sums over samples of both.
+// How well colours separate the two surfaces of an edge, from sums over samples of both.
 template <typename V>
 struct Separation {
   V seen[2];                     // weights of the samples
