@@ -150,8 +150,6 @@ def cost_of_matting(kernel: str, r: Any, items: int, channels: int) -> tuple[flo
         "find_edges": 2,
         "find_clean": 2 * channels + 2,
         "split": 2 * channels + 2 + planes,
-        "cover": 2 * planes + 2 * channels + 3,
-        "cover_back": 3 * planes + 4 * channels + 6,
         "split_back": 2 * planes + 2,
         "gather": 2 * r.planes + 2,
         "find_clean_back": 3 * channels + 1,

@@ -147,9 +147,8 @@ def test_pictures_are_split_by_kernels_and_are_the_plain_engines(
     leaf = light.clone().requires_grad_()
     found = blur_by_coc(leaf, coc_px, **options)
     assert {*launched} >= FORWARD
-    assert ("cover" in launched) == (way == "matte")
     (gradient,) = torch.autograd.grad(found.sum(), leaf)
-    assert {*launched} >= BACKWARD and ("cover_back" in launched) == (way == "matte")
+    assert {*launched} >= BACKWARD
     monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
     expected = blur_by_coc(leaf, coc_px, **options)
     assert_same_picture(expected.detach(), found.detach(), light)

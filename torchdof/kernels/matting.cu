@@ -4,9 +4,8 @@
 //   find_edges   the certainty of each pixel that it lies at an edge, from the coc of the 3 x 3 pixels around
 //   find_clean   its light without that of the other surface, from light, coc and certainty of those pixels
 //   split        both surfaces of the pixels at an edge, from all of these
-//   cover        the surfaces of a matte, where there is one
 //
-// Each step but the last has a `_back`. There a pixel at an edge writes the parts of the gradients by the values of its 3 x 3 pixels,
+// Each step has a `_back`. There a pixel at an edge writes the parts of the gradients by the values of its 3 x 3 pixels,
 // and `gather` adds up the parts that concern a pixel. So each sum has a fixed order. Gradients of x are named of_x.
 #include "matting.h"
 #include "split.h"
@@ -52,82 +51,6 @@ extern "C" __global__ void split(const __grid_constant__ Run r) {
   }
   r.surfaces[p.in(r, PLANES, COC)] = s.mixed.by_owner(s.ends.far, s.ends.near);
   r.surfaces[p.in(r, PLANES, WEIGHT)] = s.mixed.weight;
-}
-
-// The surfaces of a pixel by a matte, from those of `split`: the certainty that they are known, weights of the other surface in the one
-// and the other, and both.
-struct Cover {
-  float certainty, kept, given, both, known;
-};
-__device__ inline Cover cover_of(const Run &r, const Pixel &p) {
-  Cover v;
-  v.certainty = r.covered[p.in(r, CHANNELS + 3, CHANNELS + 2)];
-  v.kept = (1 - v.certainty) * r.surfaces[p.in(r, PLANES, WEIGHT)];
-  v.given = v.certainty * r.covered[p.in(r, CHANNELS + 3, CHANNELS + 1)];
-  v.both = v.kept + v.given;
-  v.known = torchdof::max(v.both, LEAST);
-  return v;
-}
-// Its other light, of a channel, and coc.
-__device__ inline float covered_light(const Run &r, const Pixel &p, const Cover &v, int c) {
-  const float given = v.certainty * r.covered[p.in(r, CHANNELS + 3, c)] * r.light[p.in(r, CHANNELS, c)];
-  return v.both > 0 ? (v.kept * r.surfaces[p.in(r, PLANES, OTHER + c)] + given) / v.known : 0.0f;
-}
-__device__ inline float covered_coc(const Run &r, const Pixel &p, const Cover &v) {
-  const float coc = r.surfaces[p.in(r, PLANES, COC)];
-  return v.both > 0 ? (v.kept * coc + v.given * r.covered[p.in(r, CHANNELS + 3, CHANNELS)]) / v.known : coc;
-}
-
-extern "C" __global__ void cover(const __grid_constant__ Run r) {
-  const Pixel p;
-  if (!p.is_in(r)) return;
-  const Cover v = cover_of(r, p);
-  if (!(v.certainty > 0)) {
-    for (int n = 0; n < PLANES; n++) r.result[p.in(r, PLANES, n)] = r.surfaces[p.in(r, PLANES, n)];
-    return;
-  }
-  EACH_CHANNEL {
-    const float other = covered_light(r, p, v, c);
-    r.result[p.in(r, PLANES, c)] = (r.light[p.in(r, CHANNELS, c)] - v.both * other) / (1 - v.both);
-    r.result[p.in(r, PLANES, OTHER + c)] = other;
-  }
-  r.result[p.in(r, PLANES, COC)] = covered_coc(r, p, v);
-  r.result[p.in(r, PLANES, WEIGHT)] = v.both;
-}
-
-// The gradients by the surfaces of `split` and by those of the matte; that by the light is the first of the gradients by the values.
-extern "C" __global__ void cover_back(const __grid_constant__ Run r) {
-  const Pixel p;
-  if (!p.is_in(r)) return;
-  const Cover v = cover_of(r, p);
-  const bool is_covered = v.certainty > 0, has_other = v.both > 0;
-  float of_kept = 0, of_given = 0, of_both = is_covered ? r.of_result[p.in(r, PLANES, WEIGHT)] : 0.0f, of_known = 0, of_certainty = 0;
-  EACH_CHANNEL {
-    const float of_own = r.of_result[p.in(r, PLANES, c)], of_other = r.of_result[p.in(r, PLANES, OTHER + c)];
-    const float light = r.light[p.in(r, CHANNELS, c)], given = r.covered[p.in(r, CHANNELS + 3, c)], split = r.surfaces[p.in(r, PLANES, OTHER + c)];
-    const float other = covered_light(r, p, v, c), own = (light - v.both * other) / (1 - v.both), of_left = of_own / (1 - v.both);
-    const float of_sum = is_covered && has_other ? (of_other - of_left * v.both) / v.known : 0.0f;  // by the other light times `known`
-    of_both += is_covered ? of_left * (own - other) : 0.0f;
-    of_kept += of_sum * split;
-    of_certainty += of_sum * given * light;
-    of_known -= of_sum * other;
-    r.of_surfaces[p.in(r, PLANES, c)] = is_covered ? 0.0f : of_own;
-    r.of_surfaces[p.in(r, PLANES, OTHER + c)] = is_covered ? of_sum * v.kept : of_other;
-    r.of_values[p.in(r, VALUES, c)] = is_covered ? of_left + of_sum * v.certainty * given : 0.0f;
-    r.of_covered[p.in(r, CHANNELS + 3, c)] = of_sum * v.certainty * light;
-  }
-  const float of_coc = r.of_result[p.in(r, PLANES, COC)], of_sum = is_covered && has_other ? of_coc / v.known : 0.0f;
-  of_kept += of_sum * r.surfaces[p.in(r, PLANES, COC)];
-  of_given += of_sum * r.covered[p.in(r, CHANNELS + 3, CHANNELS)];
-  of_known -= of_sum * covered_coc(r, p, v);
-  if (v.both >= LEAST) of_both += of_known;
-  of_kept += of_both, of_given += of_both;
-  r.of_surfaces[p.in(r, PLANES, COC)] = is_covered && has_other ? of_sum * v.kept : of_coc;
-  r.of_surfaces[p.in(r, PLANES, WEIGHT)] = is_covered ? of_kept * (1 - v.certainty) : r.of_result[p.in(r, PLANES, WEIGHT)];
-  r.of_covered[p.in(r, CHANNELS + 3, CHANNELS)] = of_sum * v.given;
-  r.of_covered[p.in(r, CHANNELS + 3, CHANNELS + 1)] = of_given * v.certainty;
-  const float weight = r.covered[p.in(r, CHANNELS + 3, CHANNELS + 1)];
-  r.of_covered[p.in(r, CHANNELS + 3, CHANNELS + 2)] = of_certainty + of_given * weight - of_kept * r.surfaces[p.in(r, PLANES, WEIGHT)];
 }
 
 // The parts of the gradients that a pixel at an edge writes.

@@ -30,17 +30,14 @@ struct Run {
   const float *valid;      // the same, 0 where a pixel is left out; null: all count
   const float *darkest;    // light of an item, [items, CHANNELS]
   const float *brightest;  // the same
-  const float *covered;    // surfaces of a matte: parts of the light, coc, weight, certainty; [items, CHANNELS + 3, height, width]
   float *edge;             // certainty that a pixel lies at an edge, 0 to 1, as coc
   float *clean;            // as light
   float *surfaces;         // [items, PLANES, height, width]
-  float *result;           // the same with those of a matte
   const int *slots;        // place in the parts of a pixel at an edge, counted from 1, as coc
   float *parts;            // [OF_ENDS + 2 CHANNELS, count]
   float *of_surfaces;      // as surfaces
   const float *of_result;  // the same
   float *of_values;        // [items, VALUES, height, width]
-  float *of_covered;       // as covered
   float *of_rows;          // of darkest and brightest, and how many pixels have this light: [items, 4 CHANNELS, height]
   const float *of_ends;    // the same of an item, [items, 4 CHANNELS]
   int height;

@@ -33,18 +33,15 @@ class Matting:
         light: ``[B, C, H, W]``.
         coc_px: ``[B, 1, H, W]``, signed.
         valid: ``[B, 1, H, W]``, 0 where a pixel is left out; None means all count.
-        covered: Other surfaces by a matte, ``[B, C + 3, H, W]``, or None.
         launch: The kernels; None takes those of the images' device.
     """
 
-    def __init__(
-        self, light: Tensor, coc_px: Tensor, valid: Tensor | None, covered: Tensor | None, launch: Launch | None = None
-    ) -> None:
-        self._light, self._coc, self._covered = light, coc_px, covered
+    def __init__(self, light: Tensor, coc_px: Tensor, valid: Tensor | None, launch: Launch | None = None) -> None:
+        self._light, self._coc = light, coc_px
         self._launch = launch or module(light.shape[1], light.device.index or 0)
         self._darkest, self._brightest = light.flatten(2).aminmax(dim=2)  # of each channel
         self._edge, self._clean = torch.empty_like(coc_px), torch.empty_like(light)
-        maps = {"light": light, "coc": coc_px, "valid": valid, "covered": covered, "edge": self._edge}
+        maps = {"light": light, "coc": coc_px, "valid": valid, "edge": self._edge}
         maps |= {"clean": self._clean, "darkest": self._darkest, "brightest": self._brightest}
         self._common = argument_type()(height=light.shape[2], width=light.shape[3])
         self._set(**maps)
@@ -53,27 +50,16 @@ class Matting:
 
     def surfaces(self) -> Tensor:
         """Own light, other light, coc and weight of the other surface of each pixel, ``[B, 2 C + 2, H, W]``."""
-        surfaces = self._split()
-        if self._covered is None:
-            return surfaces
-        result = torch.empty_like(surfaces)
-        self._set(result=result)
-        self._run("cover")
-        return result
+        surfaces = self._planes(2 * self._light.shape[1] + 2)
+        self._set(surfaces=surfaces)
+        self._run("split")
+        return surfaces
 
-    def gradients(self, of_result: Tensor) -> list[Tensor]:
-        """The gradients by light, coc and, where it is given, ``covered``, from that of :meth:`surfaces`."""
-        channels = self._light.shape[1]
+    def gradients(self, of_surfaces: Tensor) -> list[Tensor]:
+        """The gradients by light and coc from that of :meth:`surfaces`."""
+        channels, of_surfaces = self._light.shape[1], of_surfaces.contiguous()
         of_values = self._planes(2 * channels + 2).zero_()
-        of_covered: list[Tensor] = []
-        of_surfaces = of_result = of_result.contiguous()
-        if self._covered is not None:
-            self._split()
-            of_surfaces, of_covered = torch.empty_like(of_result), [torch.empty_like(self._covered)]
-            self._set(of_result=of_result, of_covered=of_covered[0])
         self._set(of_values=of_values, of_surfaces=of_surfaces)
-        if self._covered is not None:
-            self._run("cover_back")
 
         # the pixels at edges, numbered from 1, and their parts of the gradients
         slots = (self._edge > 0).flatten().cumsum(0, dtype=torch.int32)
@@ -91,15 +77,7 @@ class Matting:
         self._gather(0, channels + 2)
         self._run("find_edges_back")
         self._gather(channels, 1)
-        return [of_values[:, :channels], of_values[:, channels : channels + 1], *of_covered]
-
-    def _split(self) -> Tensor:
-        """The surfaces without those of a matte."""
-        surfaces = self._planes(2 * self._light.shape[1] + 2)
-        self._surfaces = surfaces  # kept in memory as long as the argument points to it
-        self._set(surfaces=surfaces)
-        self._run("split")
-        return surfaces
+        return [of_values[:, :channels], of_values[:, channels : channels + 1]]
 
     def _gather(self, first: int, planes: int) -> None:
         """Adds the parts of the gradients by some values of each pixel."""

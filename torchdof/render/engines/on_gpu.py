@@ -25,7 +25,7 @@ from ..surfaces import edge_colours, edge_prior, edge_search
 from ..surfaces.edge_colours import Looks, Shown
 from ..surfaces.edge_search import Edges
 from ..surfaces.frame import PaddedFrame, PaddedSurface, maps_of, surfaces_of
-from ..surfaces.matting import Matted
+from ..surfaces.matting import Matted, with_covered
 from ..surfaces.matting import matte as plain_matte
 from ..surfaces.windows import mean_around
 from .compiled_steps import differentiable
@@ -76,7 +76,8 @@ def matte(
     is_taken = takes(maps, channels, 2) and len(light) <= matting.MOST_ITEMS
     if not is_taken or _missing(_matte_of_trial, channels, light.device.index or 0):
         return plain_matte(light, coc_px, valid, ops, covered)
-    return Matted(*_matte_by_kernels(light, coc_px, valid, covered).split([channels, channels, 1, 1], 1))
+    surfaces = Matted(*_matte_by_kernels(light, coc_px, valid).split([channels, channels, 1, 1], 1))
+    return surfaces if covered is None else with_covered(light, surfaces, covered)
 
 
 def find_edges(light: Tensor, nearness: Tensor, valid: Tensor, step: Tensor) -> Edges:
@@ -266,27 +267,19 @@ def _judged_by_kernels(
     return Shown(*edges.judge(*maps, sharpness, in_prior, mixtures))
 
 
-def _matte_by_kernels(
-    light: Tensor, coc_px: Tensor, valid: Tensor | None = None, covered: Tensor | None = None
-) -> Tensor:
-    """The surfaces of :func:`matte`, ``[B, 2 C + 2, H, W]``."""
-    constant = [] if valid is None else [valid]
-    varied = [light, coc_px, *([] if covered is None else [covered])]
+def _matte_by_kernels(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> Tensor:
+    """The surfaces of :func:`matte` without a matte, ``[B, 2 C + 2, H, W]``."""
+    given = [light, coc_px, *([] if valid is None else [valid])]
 
-    def named(maps: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
-        maps = [t.contiguous() for t in maps]
-        return maps[0], maps[1], maps[-1] if constant else None, None if covered is None else maps[2]
-
-    def plain(*maps: Tensor) -> Tensor:
-        light, coc_px, valid, covered = named(maps)
-        return torch.cat(plain_matte(light, coc_px, valid, covered=covered), 1)
+    def matting_of(*maps: Tensor) -> matting.Matting:
+        light, coc_px, *valid = (t.contiguous() for t in maps)
+        return matting.Matting(light, coc_px, *(valid or [None]))
 
     return differentiable(
-        lambda *maps: matting.Matting(*named(maps)).surfaces(),
-        lambda gradient, *maps: matting.Matting(*named(maps)).gradients(gradient),
-        plain,
-        *varied,
-        *constant,
+        lambda *maps: matting_of(*maps).surfaces(),
+        lambda gradient, *maps: matting_of(*maps).gradients(gradient),
+        lambda *maps: torch.cat(plain_matte(*maps), 1),
+        *given,
     )
 
 

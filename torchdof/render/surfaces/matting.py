@@ -18,7 +18,7 @@ from ..engines.ops import EAGER, Ops
 from ..rules import active
 from .windows import gaussian, highest
 
-__all__ = ["FALLOFF", "NEAR_BY_PX", "NEVER_PX", "PLACE_SLOPE", "Matted", "matte", "on_near"]
+__all__ = ["FALLOFF", "NEAR_BY_PX", "NEVER_PX", "PLACE_SLOPE", "Matted", "matte", "on_near", "with_covered"]
 
 NEVER_PX = 1e9
 """A coc in pixels that no pixel has: marks the absence of a surface."""
@@ -95,10 +95,10 @@ def matte(
         surfaces = _split(light, coc_px, valid, ops)
     else:
         surfaces = Matted(*found.split([light.shape[1], light.shape[1], 1, 1], 1))
-    return surfaces if covered is None else _with_covered(light, surfaces, covered)
+    return surfaces if covered is None else with_covered(light, surfaces, covered)
 
 
-def _with_covered(light: Tensor, surfaces: Matted, covered: Tensor) -> Matted:
+def with_covered(light: Tensor, surfaces: Matted, covered: Tensor) -> Matted:
     """The surfaces of each pixel: those of a matte by their certainty, those given for the rest."""
     share, coc, weight, certainty = covered.split([light.shape[1], 1, 1, 1], 1)
     kept, given = (1.0 - certainty) * surfaces.other_weight, certainty * weight
