@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, settings
 
 from tests import exported, on_cpu
 from torchdof import native
-from torchdof.kernels import edges, layers, loader, matting
+from torchdof.kernels import edges, layers, loader, matting, rays
 from torchdof.render.engines import on_gpu
 from torchdof.tensors import TRACEABLE
 
@@ -73,6 +73,7 @@ def launched(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     monkeypatch.setattr(layers, "module", recording(on_cpu.layers_module))
     monkeypatch.setattr(matting, "module", recording(on_cpu.matting_module))
     monkeypatch.setattr(edges, "module", recording(on_cpu.edges_module))
+    monkeypatch.setattr(rays, "module", recording(on_cpu.rays_module))
     monkeypatch.setenv("TORCHDOF_ENGINE", "gpu")
     for cached in (on_gpu.why_missing, on_gpu._warn):
         cached.cache_clear()

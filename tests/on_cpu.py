@@ -119,6 +119,11 @@ def edges_module(channels: int, device: int = 0) -> loader.Launch:
     return _module("edges.cu", "-O3", *edges.options(channels))
 
 
+def rays_module(device: int = 0) -> loader.Launch:
+    """As :func:`torchdof.kernels.rays.module`, with that driver."""
+    return _module("rays.cu", "-O3")
+
+
 def without(wrong: str, module: Callable[..., loader.Launch]) -> Callable[..., loader.Launch]:
     """A module of which one kernel is not launched, as on a device on which it fails."""
 

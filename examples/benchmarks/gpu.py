@@ -32,7 +32,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from examples.benchmarks.steps import Counted, crops
 from torchdof import blur_by_coc, native
 from torchdof.functional import splat
-from torchdof.kernels import edges, layers, loader, matting
+from torchdof.kernels import edges, layers, loader, matting, rays
 from torchdof.render import highlights
 from torchdof.render.engines import on_gpu
 
@@ -48,7 +48,7 @@ CASES = [
 
 LAYERS_OF_THE_MODEL = {
     *("terms", "composite", "walk_back", "convolve_back", "terms_back", "stand_ins", "stand_ins_back"),
-    *("upsample", "upsample_back", "pass_back"),
+    *("upsample", "upsample_back", "pass_back", "block_rays"),
 }
 """Kernels that are not launched without a device: their time grows with the blur."""
 
@@ -99,23 +99,18 @@ class Launches:
         self.ms: dict[str, float] = collections.defaultdict(float)
 
     def __enter__(self) -> "Launches":
-        self._modules = layers.module, matting.module, edges.module
-        of_layers, of_matting, of_edges = self._modules
-
-        def counted_layers(*variant: Any) -> loader.Launch:
-            return self._counted(of_layers(*variant), functools.partial(cost, channels=variant[0], surfaces=variant[1]))
-
-        def counted_matting(*variant: Any) -> loader.Launch:
-            return self._counted(of_matting(*variant), functools.partial(cost_of_matting, channels=variant[0]))
-
-        def counted_edges(*variant: Any) -> loader.Launch:
-            return self._counted(of_edges(*variant), functools.partial(cost_of_edges, channels=variant[0]))
-
-        layers.module, matting.module, edges.module = counted_layers, counted_matting, counted_edges  # type: ignore
+        self._modules = {kernels: kernels.module for kernels in COSTS}
+        for kernels, module in self._modules.items():
+            kernels.module = functools.partial(self._with_costs, module, COSTS[kernels])
         return self
 
     def __exit__(self, *_: Any) -> None:
-        layers.module, matting.module, edges.module = self._modules
+        for kernels, module in self._modules.items():
+            kernels.module = module
+
+    def _with_costs(self, module: Callable[..., loader.Launch], cost: Callable[..., Any], *variant: Any) -> Any:
+        """The kernels of a variant, whose launches are counted."""
+        return self._counted(module(*variant), functools.partial(cost, variant))
 
     def _counted(self, launch: loader.Launch, cost_of: Callable[..., tuple[float, float]]) -> loader.Launch:
         """A launch that is counted. Without a device the layers are not computed, only their tables of tiles."""
@@ -143,8 +138,9 @@ class Launches:
             print(f"  {kernel:15} {count:3} launches {self.ms[kernel]:8.3f} ms")
 
 
-def cost_of_matting(kernel: str, r: Any, items: int, channels: int) -> tuple[float, float]:
-    """As :func:`cost`, for the kernels of matting, after the launch."""
+def cost_of_matting(variant: Any, kernel: str, r: Any, items: int) -> tuple[float, float]:
+    """As :func:`cost_of_layers`, for the kernels of matting, after the launch."""
+    channels = variant[0]
     pixels, planes = r.height * r.width * items, 2 * channels + 2
     of_pixel = {  # values of each pixel that are read or written
         "find_edges": 2,
@@ -172,8 +168,9 @@ def cost_of_matting(kernel: str, r: Any, items: int, channels: int) -> tuple[flo
     return 4.0 * (of_pixel[kernel] * pixels + values * count), float(operations * count)
 
 
-def cost_of_edges(kernel: str, r: Any, items: int, channels: int) -> tuple[float, float]:
-    """As :func:`cost`, for the kernels of edges."""
+def cost_of_edges(variant: Any, kernel: str, r: Any, items: int) -> tuple[float, float]:
+    """As :func:`cost_of_layers`, for the kernels of edges."""
+    channels = variant[0]
     of_pixel = {  # values of each pixel that are read or written, and operations
         "find_slopes": (5, 40),
         "smooth_slopes": (2, 25),
@@ -190,8 +187,15 @@ def cost_of_edges(kernel: str, r: Any, items: int, channels: int) -> tuple[float
     return 4.0 * r.count * (channels + 10), float(r.count * window * (10 + 5 * channels))
 
 
-def cost(kernel: str, r: Any, depth: int, channels: int, surfaces: int) -> tuple[float, float]:
+def cost_of_rays(variant: Any, kernel: str, r: Any, items: int) -> tuple[float, float]:
+    """As :func:`cost_of_layers`, for the rays of highlights."""
+    bins = (ctypes.c_bool * (r.count * r.bins)).from_address(r.wanted)
+    return 4.0 * r.count * r.side**2, float(sum(bins)) * r.side**2 * (20 + 24 * r.surfaces)
+
+
+def cost_of_layers(variant: Any, kernel: str, r: Any, depth: int) -> tuple[float, float]:
     """Bytes that a launch of a kernel moves if each value is read once, and its floating-point operations."""
+    channels, surfaces = variant[:2]
     values, tile, maps = channels + 2, 16 * 32, surfaces * (channels + 2)
     items, frame = depth // max(r.layers, 1) if kernel == "convolve_back" else depth, r.scale * r.scale
     picture, canvas = r.height * r.width * (channels + 1) * depth, r.coarse_height * r.coarse_width * (channels + 1)
@@ -222,6 +226,15 @@ def cost(kernel: str, r: Any, depth: int, channels: int, surfaces: int) -> tuple
         "pass_back": (2.0 * picture + canvas * depth, 0.0),
     }.get(kernel, (0.0, 0.0))
     return 4.0 * numbers, operations
+
+
+COSTS: dict[Any, Callable[..., tuple[float, float]]] = {
+    layers: cost_of_layers,
+    matting: cost_of_matting,
+    edges: cost_of_edges,
+    rays: cost_of_rays,
+}
+"""What a launch costs by the model, for each module of kernels."""
 
 
 def milliseconds(repeat: int, call: Callable[..., Any], *arguments: Any) -> float:
@@ -290,7 +303,7 @@ def first_use() -> None:
     """Seconds until the first picture: compiled and tried, then with the kept program."""
     _, light, coc_px = scene(*SMALL_CASES[0])
     for name in ("without kernels", "kernels compiled", "the kept program"):
-        for cached in (layers.module, matting.module, edges.module, on_gpu.why_missing):
+        for cached in (*(kernels.module for kernels in COSTS), on_gpu.why_missing):
             getattr(cached, "cache_clear", lambda: None)()
         start = time.perf_counter()
         with engine("torch" if name == "without kernels" else "gpu"):
@@ -326,7 +339,7 @@ def costs(ends: float) -> None:
                 print(f"{name}, a {kind}: {found[0]}; without kernels {found[1]}", flush=True)
             with Counted() as counted, Launches(counted) as launches:
                 call(light, coc_px)
-            launches.show(f"{name}, edges, matting and layers of a {kind}")
+            launches.show(f"{name}, kernels of a {kind}")
             with engine("torch"), Counted() as plain:
                 call(light, coc_px)
             print(f"  {counted.operations} operations of PyTorch, without kernels {plain.operations}", flush=True)

@@ -12,7 +12,7 @@ from torch import Tensor
 from tests import on_cpu
 from tests.scenes import CAMERA, CASES, Case, assert_same_picture, post_before_lamps, random_scene
 from torchdof import BlurTable, DepthOfField, blur_by_coc
-from torchdof.kernels import edges, layers, loader, matting
+from torchdof.kernels import edges, layers, loader, matting, rays
 from torchdof.render import pipeline
 from torchdof.render.engines import on_gpu
 from torchdof.render.layers import composite
@@ -222,7 +222,7 @@ def test_without_kernels_there_is_one_warning_and_the_plain_engines_picture(
     def missing(*variant: Any) -> loader.Launch:
         raise OSError("NVRTC of CUDA 12.8 was not found")
 
-    for kernels in (edges, layers, matting):
+    for kernels in (edges, layers, matting, rays):
         monkeypatch.setattr(kernels, "module", missing)
     monkeypatch.setenv("TORCHDOF_ENGINE", "auto")
     with pytest.warns(RuntimeWarning, match="slower: NVRTC of CUDA 12.8 was not found") as warned:

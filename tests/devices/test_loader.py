@@ -34,6 +34,7 @@ VARIANTS = {
     ("matting.cu", "largest"): matting.options(matting.MOST_CHANNELS),
     ("edges.cu", "image"): edges.options(3),
     ("edges.cu", "largest"): edges.options(edges.MOST_CHANNELS),
+    ("rays.cu", "image"): [],
 }
 THREADS = {"composite": 128, "convolve_back": 128, "sum_rows": 32}  # of a block
 
@@ -48,6 +49,7 @@ THREADS = {"composite": 128, "convolve_back": 128, "sum_rows": 32}  # of a block
         ("matting.cu", "largest", 80),
         *(("edges.cu", "image", capability) for capability in (75, 90, 120)),
         ("edges.cu", "largest", 80),
+        *(("rays.cu", "image", capability) for capability in (75, 90, 120)),
     ],
 )
 def test_kernels_compile_for_every_device_without_spills(source: str, variant: str, capability: int) -> None:

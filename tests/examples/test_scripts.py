@@ -80,7 +80,7 @@ gpu.main()
     assert "no CUDA device: the kernels run on the CPU" in printed and "failed" not in printed
     apart = re.findall(r"picture (\S+) of the light nearby, gradients by light (\S+), coc (\S+)", printed)
     assert apart and all(float(value) < limit for value, limit in zip(apart[0], (1e-5, 1e-4, 1e-4), strict=True))
-    counts = re.findall(r"matting and layers of a picture: (\d+) launches, (\d+) MB, by the model", printed)
+    counts = re.findall(r"kernels of a picture: (\d+) launches, (\d+) MB, by the model", printed)
     launches, mib = map(float, counts[0])
     assert launches > 8 and mib > 0 and "composite" in printed and "split_back" in printed
 

@@ -25,6 +25,7 @@ from ..optics.blur_table import BlurTable
 from ..optics.kernel_bank import bank_of
 from ..optics.placed_kernels import FieldMask, placed_between, ray_masks
 from ..tensors import is_empty, is_traced, recomputed
+from .engines import on_gpu
 from .engines.ops import EAGER, Ops
 from .layers.layer_cocs import mean_change
 from .layers.plan import KERNELS_PER_PX, kernels_for
@@ -296,7 +297,7 @@ class Occluders:
             bins = int(torch.stack([place.detach().amax() for place, _ in shown]).amax()) + 2
         self.bins = bins
         self.counts = covered_cells([(place.detach(), cover.detach()) for place, cover in shown], self.bins)
-        self.shown = [torch.stack([t.flatten() for t in maps]) for maps in zip(*shown, strict=True)]
+        self.shown = [torch.stack([t[:, 0] for t in maps]) for maps in zip(*shown, strict=True)]  # [surfaces, B, H, W]
 
     def hidden(self, item: Tensor, row: Tensor, column: Tensor, coc: Tensor, step: Tensor) -> Tensor:
         """Fraction of each ray that is blocked, ``[n, k, k]``, of highlights ``[n]`` with their place and signed coc.
@@ -323,26 +324,45 @@ class Occluders:
             return self.counts.flatten().index_select(0, ((line + y) * columns + x).flatten())
 
         count = count_at(bottom, right) - count_at(top, right) - count_at(bottom, left) + count_at(top, left)
-        pairs = ((count > 0) & (fades.detach().flatten() > 0)).nonzero()[:, 0]
-        hidden = coc.new_zeros(coc.shape[0], step.shape[0], step.shape[0])
+        wanted = ((count > 0) & (fades.detach().flatten() > 0)).view_as(fades)
+        return on_gpu.blocked(_blocked, scale, fades, wanted, (item, row, column), len(step), self.shown)
 
-        def blocked(pair: Tensor) -> Tensor:
-            """Fraction of the rays of pairs ``[P]`` that is blocked, ``[P, k, k]``."""
-            source, bin_of = pair // self.bins, pair % self.bins
-            way = scale.flatten().index_select(0, pair)[:, None] * step
-            items, rows, columns = (t.index_select(0, source)[:, None] for t in (item, row, column))
-            rows, columns = (rows + way)[:, :, None], (columns + way)[:, None, :]
-            around, down, aside = pixels.corners(items[:, :, None], rows, columns, self.height, self.width)
-            pixel = torch.stack(around)  # [4, P, k, k]
-            place, cover = (t.index_select(1, pixel.flatten()).unflatten(1, pixel.shape) for t in self.shown)
-            covered = (cover * (1.0 - (place - bin_of[:, None, None]).abs()).clamp_min(0.0)).sum(0)
-            above, below = torch.lerp(covered[0::2], covered[1::2], aside)
-            return torch.lerp(above, below, down) * fades.flatten().index_select(0, pair)[:, None, None]
 
-        most = _PAIR_TAPS if coc.device.type == "cpu" else _PAIR_TAPS_GPU
-        for part in [pairs] if is_traced() else pairs.split(max(1, most // len(step) ** 2)):
-            hidden = hidden.index_add(0, part // self.bins, recomputed(functools.partial(blocked, part)))
-        return hidden.clamp(max=1.0)
+def _blocked(
+    scale: Tensor, fades: Tensor, wanted: Tensor, at: Sequence[Tensor], side: int, shown: Sequence[Tensor]
+) -> Tensor:
+    """Fraction of each ray that is blocked, ``[n, k, k]``.
+
+    Args:
+        scale: Way of a ray in a bin, over that on the picture, ``[n, bins]``.
+        fades: How far a surface in a bin blocks a ray, like ``scale``, 0 to 1.
+        wanted: Whether a bin has surfaces within reach, like ``scale``.
+        at: Item, row and column of the highlights, ``[n]`` each.
+        side: k, the width of the kernels.
+        shown: Coc in bins and cover of the occluders, ``[surfaces, B, H, W]`` each.
+    """
+    step, (height, width) = torch.arange(-(side // 2), side // 2 + 1, device=scale.device), shown[0].shape[-2:]
+    bins, maps = scale.shape[1], [t.flatten(1) for t in shown]
+    pairs = wanted.flatten().nonzero()[:, 0]  # of a highlight and a bin
+    hidden = scale.new_zeros(scale.shape[0], side, side)
+
+    def of_pairs(pair: Tensor) -> Tensor:
+        """Fraction of the rays of pairs ``[P]`` that is blocked, ``[P, k, k]``."""
+        source, bin_of = pair // bins, pair % bins
+        way = scale.flatten().index_select(0, pair)[:, None] * step
+        items, rows, columns = (t.index_select(0, source)[:, None] for t in at)
+        rows, columns = (rows + way)[:, :, None], (columns + way)[:, None, :]
+        around, down, aside = pixels.corners(items[:, :, None], rows, columns, height, width)
+        pixel = torch.stack(around)  # [4, P, k, k]
+        place, cover = (t.index_select(1, pixel.flatten()).unflatten(1, pixel.shape) for t in maps)
+        covered = (cover * (1.0 - (place - bin_of[:, None, None]).abs()).clamp_min(0.0)).sum(0)
+        above, below = torch.lerp(covered[0::2], covered[1::2], aside)
+        return torch.lerp(above, below, down) * fades.flatten().index_select(0, pair)[:, None, None]
+
+    most = _PAIR_TAPS if scale.device.type == "cpu" else _PAIR_TAPS_GPU
+    for part in [pairs] if is_traced() else pairs.split(max(1, most // side**2)):
+        hidden = hidden.index_add(0, part // bins, recomputed(functools.partial(of_pairs, part)))
+    return hidden.clamp(max=1.0)
 
 
 def covered_cells(places: Sequence[tuple[Tensor, Tensor]], bins: int) -> Tensor:

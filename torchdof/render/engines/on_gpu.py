@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from ... import native
-from ...kernels import edges, layers, matting
+from ...kernels import edges, layers, matting, rays
 from ...tensors import is_differentiated, is_in_memory, is_traced, without_autocast
 from ..layers.layer_weights import ramps
 from ..surfaces import edge_colours, edge_prior, edge_search
@@ -121,6 +121,27 @@ def _has_no_edge_kernels(light: Tensor, like: Tensor) -> bool:
     # the number of items after `takes`, as in `composited`
     is_taken = takes([light, like], channels, 1) and len(light) <= edges.MOST_ITEMS
     return not is_taken or _missing(_edges_of_trial, channels, like.device.index or 0)
+
+
+def blocked(
+    plain: Callable[..., Tensor],
+    scale: Tensor,
+    fades: Tensor,
+    wanted: Tensor,
+    at: Sequence[Tensor],
+    side: int,
+    shown: Sequence[Tensor],
+) -> Tensor:
+    """``plain(scale, fades, wanted, at, side, shown)``, the rays that are blocked, by a kernel without gradients.
+
+    Raises:
+        ValueError: If it cannot be used and ``TORCHDOF_ENGINE`` is ``gpu``.
+    """
+    given, maps = (scale, fades, wanted, at, side, shown), (scale, fades, *shown)
+    is_taken = takes(maps, 1, 1) and not any(map(is_differentiated, maps))
+    if not is_taken or _missing(_rays_of_trial, plain, scale.device.index or 0):
+        return plain(*given)
+    return _blocked_by_kernels(*given)
 
 
 def takes(maps: Sequence[Tensor], channels: int, surfaces: int) -> bool:
@@ -256,6 +277,28 @@ def _edges_by_kernels(light: Tensor, nearness: Tensor, valid: Tensor, step: Tens
     return Edges(*edges.find(*maps, edge_search.RAMP_REACH, light.shape[1]))
 
 
+def _rays_of_trial(plain: Callable[..., Tensor], device: int) -> Any:
+    """Rays of four highlights past random surfaces in three bins."""
+    dice = torch.Generator().manual_seed(0)
+    places = [torch.randint(0, most, (4,), generator=dice).to(torch.device(DEVICE, device)) for most in (2, 9, 12)]
+
+    def hidden(compute: Callable[..., Tensor], scale: Tensor, fades: Tensor, place: Tensor, cover: Tensor) -> Tensor:
+        maps = [t.detach() for t in (scale, fades, place, cover)]
+        return compute(*maps[:2], fades > 0.3, places, 7, maps[2:])
+
+    maps = [torch.rand(size, generator=dice) for size in ((4, 3), (4, 3), (2, 2, 9, 12), (2, 2, 9, 12))]
+    maps[2] = 2.0 * maps[2]
+    return maps, functools.partial(hidden, plain), functools.partial(hidden, _blocked_by_kernels)
+
+
+def _blocked_by_kernels(
+    scale: Tensor, fades: Tensor, wanted: Tensor, at: Sequence[Tensor], side: int, shown: Sequence[Tensor]
+) -> Tensor:
+    names = ("scale", "fades", "wanted", "item", "row", "column", "place", "cover")
+    maps = (t.contiguous() for t in (scale, fades, wanted, *at, *shown))
+    return rays.blocked(dict(zip(names, maps, strict=True)), side)
+
+
 def _calibrated_by_kernels(light: Tensor, kinds: Tensor, score: Tensor) -> Tensor:
     return edges.calibrate(kinds, score, len(light), edge_search.PLACES, edge_search.DIRECTIONS, light.shape[1])
 
@@ -273,7 +316,7 @@ def _matte_by_kernels(light: Tensor, coc_px: Tensor, valid: Tensor | None = None
 
     def matting_of(*maps: Tensor) -> matting.Matting:
         light, coc_px, *valid = (t.contiguous() for t in maps)
-        return matting.Matting(light, coc_px, *(valid or [None]))
+        return matting.Matting(light, coc_px, valid[0] if valid else None)
 
     return differentiable(
         lambda *maps: matting_of(*maps).surfaces(),
