@@ -22,7 +22,8 @@ def random_rays(seed: int) -> tuple[Any, ...]:
     scale = 4.0 * torch.rand(count, bins, generator=dice) - 2.0
     fades, wanted = torch.rand(count, bins, generator=dice), torch.rand(count, bins, generator=dice) > 0.3
     place = (bins + 1.0) * torch.rand(surfaces, items, height, width, generator=dice)
-    return scale, fades, wanted, at, side, [place, torch.rand(place.shape, generator=dice)]
+    step = torch.arange(-(side // 2), side // 2 + 1)
+    return scale, fades, wanted, at, step, [place, torch.rand(place.shape, generator=dice)]
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -35,11 +36,12 @@ def test_blocked_rays_are_the_plain_engines(seed: int, launched: list[str]) -> N
 
 
 def test_without_highlights_nothing_is_launched(launched: list[str]) -> None:
-    scale, fades, wanted, at, side, shown = random_rays(0)
-    on_gpu.blocked(highlights._blocked, scale, fades, wanted, at, side, shown)  # the trial
+    scale, fades, wanted, at, step, shown = random_rays(0)
+    on_gpu.blocked(highlights._blocked, scale, fades, wanted, at, step, shown)  # the trial
     launched.clear()
-    none = [t[:0] for t in (scale, fades, wanted)], [t[:0] for t in at]
-    assert on_gpu.blocked(highlights._blocked, *none[0], none[1], side, shown).shape == (0, side, side)
+    scale, fades, wanted, *at = (t[:0] for t in (scale, fades, wanted, *at))
+    found = on_gpu.blocked(highlights._blocked, scale, fades, wanted, at, step, shown)
+    assert found.shape == (0, len(step), len(step))
     assert not launched
 
 

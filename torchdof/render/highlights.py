@@ -325,11 +325,11 @@ class Occluders:
 
         count = count_at(bottom, right) - count_at(top, right) - count_at(bottom, left) + count_at(top, left)
         wanted = ((count > 0) & (fades.detach().flatten() > 0)).view_as(fades)
-        return on_gpu.blocked(_blocked, scale, fades, wanted, (item, row, column), len(step), self.shown)
+        return on_gpu.blocked(_blocked, scale, fades, wanted, (item, row, column), step, self.shown)
 
 
 def _blocked(
-    scale: Tensor, fades: Tensor, wanted: Tensor, at: Sequence[Tensor], side: int, shown: Sequence[Tensor]
+    scale: Tensor, fades: Tensor, wanted: Tensor, at: Sequence[Tensor], step: Tensor, shown: Sequence[Tensor]
 ) -> Tensor:
     """Fraction of each ray that is blocked, ``[n, k, k]``.
 
@@ -338,13 +338,12 @@ def _blocked(
         fades: How far a surface in a bin blocks a ray, like ``scale``, 0 to 1.
         wanted: Whether a bin has surfaces within reach, like ``scale``.
         at: Item, row and column of the highlights, ``[n]`` each.
-        side: k, the width of the kernels.
+        step: Pixels along each axis to where a ray lands, ``[k]``, whole numbers from -(k - 1) / 2 to (k - 1) / 2.
         shown: Coc in bins and cover of the occluders, ``[surfaces, B, H, W]`` each.
     """
-    step, (height, width) = torch.arange(-(side // 2), side // 2 + 1, device=scale.device), shown[0].shape[-2:]
-    bins, maps = scale.shape[1], [t.flatten(1) for t in shown]
+    bins, maps, (height, width) = scale.shape[1], [t.flatten(1) for t in shown], shown[0].shape[-2:]
     pairs = wanted.flatten().nonzero()[:, 0]  # of a highlight and a bin
-    hidden = scale.new_zeros(scale.shape[0], side, side)
+    hidden = scale.new_zeros(scale.shape[0], step.shape[0], step.shape[0])
 
     def of_pairs(pair: Tensor) -> Tensor:
         """Fraction of the rays of pairs ``[P]`` that is blocked, ``[P, k, k]``."""
@@ -360,7 +359,7 @@ def _blocked(
         return torch.lerp(above, below, down) * fades.flatten().index_select(0, pair)[:, None, None]
 
     most = _PAIR_TAPS if scale.device.type == "cpu" else _PAIR_TAPS_GPU
-    for part in [pairs] if is_traced() else pairs.split(max(1, most // side**2)):
+    for part in [pairs] if is_traced() else pairs.split(max(1, most // len(step) ** 2)):
         hidden = hidden.index_add(0, part // bins, recomputed(functools.partial(of_pairs, part)))
     return hidden.clamp(max=1.0)
 

@@ -123,21 +123,14 @@ def _has_no_edge_kernels(light: Tensor, like: Tensor) -> bool:
     return not is_taken or _missing(_edges_of_trial, channels, like.device.index or 0)
 
 
-def blocked(
-    plain: Callable[..., Tensor],
-    scale: Tensor,
-    fades: Tensor,
-    wanted: Tensor,
-    at: Sequence[Tensor],
-    side: int,
-    shown: Sequence[Tensor],
-) -> Tensor:
-    """``plain(scale, fades, wanted, at, side, shown)``, the rays that are blocked, by a kernel without gradients.
+def blocked(plain: Callable[..., Tensor], *given: Any) -> Tensor:
+    """``plain(scale, fades, wanted, at, step, shown)``, the rays that are blocked, by a kernel without gradients.
 
     Raises:
         ValueError: If it cannot be used and ``TORCHDOF_ENGINE`` is ``gpu``.
     """
-    given, maps = (scale, fades, wanted, at, side, shown), (scale, fades, *shown)
+    scale, fades, _, _, _, shown = given
+    maps = (scale, fades, *shown)
     is_taken = takes(maps, 1, 1) and not any(map(is_differentiated, maps))
     if not is_taken or _missing(_rays_of_trial, plain, scale.device.index or 0):
         return plain(*given)
@@ -284,7 +277,8 @@ def _rays_of_trial(plain: Callable[..., Tensor], device: int) -> Any:
 
     def hidden(compute: Callable[..., Tensor], scale: Tensor, fades: Tensor, place: Tensor, cover: Tensor) -> Tensor:
         maps = [t.detach() for t in (scale, fades, place, cover)]
-        return compute(*maps[:2], fades > 0.3, places, 7, maps[2:])
+        step = torch.arange(-3, 4, device=scale.device)
+        return compute(*maps[:2], fades > 0.3, places, step, maps[2:])
 
     maps = [torch.rand(size, generator=dice) for size in ((4, 3), (4, 3), (2, 2, 9, 12), (2, 2, 9, 12))]
     maps[2] = 2.0 * maps[2]
@@ -292,11 +286,11 @@ def _rays_of_trial(plain: Callable[..., Tensor], device: int) -> Any:
 
 
 def _blocked_by_kernels(
-    scale: Tensor, fades: Tensor, wanted: Tensor, at: Sequence[Tensor], side: int, shown: Sequence[Tensor]
+    scale: Tensor, fades: Tensor, wanted: Tensor, at: Sequence[Tensor], step: Tensor, shown: Sequence[Tensor]
 ) -> Tensor:
     names = ("scale", "fades", "wanted", "item", "row", "column", "place", "cover")
     maps = (t.contiguous() for t in (scale, fades, wanted, *at, *shown))
-    return rays.blocked(dict(zip(names, maps, strict=True)), side)
+    return rays.blocked(dict(zip(names, maps, strict=True)), len(step))
 
 
 def _calibrated_by_kernels(light: Tensor, kinds: Tensor, score: Tensor) -> Tensor:
