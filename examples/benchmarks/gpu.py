@@ -266,8 +266,8 @@ def on_cpu() -> None:
     from tests import on_cpu
 
     on_gpu.DEVICE = "cpu"
-    layers.module, matting.module = on_cpu.layers_module, on_cpu.matting_module  # type: ignore[assignment]
-    edges.module = on_cpu.edges_module
+    for kernels in COSTS:
+        kernels.module = getattr(on_cpu, f"{kernels.__name__.rpartition('.')[2]}_module")
     native._library = lambda: (None, "switched off")  # as on a device: all else by PyTorch, items together
     highlights._PAIR_TAPS = highlights._PAIR_TAPS_GPU
 
@@ -314,10 +314,11 @@ def first_use() -> None:
 
 
 def same_pictures() -> None:
-    """The picture and gradients of the kernels beside those of the plain engine."""
+    """The picture and gradients of the kernels beside those of the plain engine; some pixels are lamps."""
     for size, radius_px in CASES if HAS_DEVICE else SMALL_CASES:
         name, light, coc_px = scene(size, radius_px)
-        found = step(light, coc_px)
+        light[..., 11::31, 7::29] += 20.0
+        found = [picture(light, coc_px), *step(light, coc_px)[1:]]
         with engine("torch"):
             expected = step(light, coc_px)
         local = functional.max_pool2d(expected[0].amax(1, keepdim=True), 17, 1, 8).clamp_min(1e-6)
