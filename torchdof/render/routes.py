@@ -21,7 +21,8 @@
   gradients (:mod:`torchdof.render.engines.on_gpu`). They split the mixed pixels of images of up to 8 channels, and blur
   and composite layers of up to 8 channels, or of any number of colours with kernels of their own. With a table that
   depends on the place, `method="fold"` or an aperture with a gradient, they split pixels alone. In all these calls, and
-  in those without occlusion, they find the edges of depth, which have no gradient.
+  in those without occlusion, they find the edges of depth, which have no gradient; without gradients they block the
+  rays of highlights too.
 - otherwise: float64, or another device.
 - PyTorch: PyTorch renders alone. So it does where there is no compiled engine, or no NVRTC beside PyTorch for the
   kernels; with `TORCHDOF_ENGINE=torch`; and in forward mode or under `torch.func`.

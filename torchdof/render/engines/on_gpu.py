@@ -1,7 +1,7 @@
 """Steps of the picture on a CUDA device, by the kernels of :mod:`torchdof.kernels`.
 
-They find and judge the edges of depth, split mixed pixels, and blur and composite the layers, the latter two with their
-gradients.
+They find and judge the edges of depth, block the rays of highlights, split mixed pixels, and blur and composite the
+layers, the last two with their gradients.
 
 Before a device first uses some kernels, they and the plain engine compute a small frame. If the results or the
 gradients differ, or if the kernels cannot be compiled, the plain engine is used from then on, with one warning that
