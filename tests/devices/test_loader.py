@@ -29,11 +29,11 @@ def has_nvrtc() -> bool:
 NEEDS_NVRTC = pytest.mark.skipif(not has_nvrtc(), reason="NVRTC of CUDA 12 is not installed")
 VARIANTS = {
     ("layers.cu", "image"): layers.options(3, 2, False),
-    ("layers.cu", "largest"): layers.options(layers.MOST_CHANNELS, layers.MOST_SURFACES, True),
+    ("layers.cu", "largest"): layers.options(loader.MOST_CHANNELS, layers.MOST_SURFACES, True),
     ("matting.cu", "image"): matting.options(3),
-    ("matting.cu", "largest"): matting.options(matting.MOST_CHANNELS),
+    ("matting.cu", "largest"): matting.options(loader.MOST_CHANNELS),
     ("edges.cu", "image"): edges.options(3),
-    ("edges.cu", "largest"): edges.options(edges.MOST_CHANNELS),
+    ("edges.cu", "largest"): edges.options(loader.MOST_CHANNELS),
     ("rays.cu", "image"): [],
 }
 THREADS = {"composite": 128, "convolve_back": 128, "sum_rows": 32}  # of a block

@@ -1,6 +1,6 @@
-// Finds the edges of maps of depth, and judges their pixels by colour, on a GPU: torchdof/render/surfaces/edge_search.py,
-// edge_colours.py and edge_prior.py, whose docstrings have the steps. NVRTC compiles this file at first use, with the number CHANNELS defined. Forward
-// only; without shared memory, barriers and atomic operations, as layers.cu.
+// Finds the edges of maps of depth, and judges their pixels by colour, on a GPU: edge_search.py, edge_colours.py and
+// edge_prior.py in torchdof/render/surfaces, whose docstrings have the steps. NVRTC compiles this file at first use, with the
+// number CHANNELS defined. Forward only; without shared memory, barriers and atomic operations, as layers.cu.
 //
 //   find_slopes    slope, jump and steepness of each pixel
 //   smooth_slopes  the mean slope around it
@@ -241,14 +241,14 @@ extern "C" __global__ void decide(const __grid_constant__ Run r) {
   const int k = blockIdx.x * BLOCK + threadIdx.x;
   if (k >= r.count) return;
   const Judged p(r, k);
-  const float similar = SIMILAR * square(p.own) + 1e-12f;
+  const float per_light = torchdof::per_light(square(p.own));
   float total = 0, sum = 0, strongest = 0;
   each_around(r, p.pixel, 1, [&](const Pixel &q, int, int) {
     const float score = r.scores[q.in(r, 1, 0)];
     if (!(absolute(score) <= MOST_ODDS)) return;  // no pixel of the list
     float apart[CHANNELS];
     EACH_CHANNEL apart[c] = look(r, q, c) - p.own[c];
-    const float alike = 1 / (1 + square(apart) / similar);
+    const float alike = 1 / (1 + square(apart) * per_light);
     total += alike;
     sum += alike * score;
     strongest = max(strongest, absolute(score));
@@ -266,15 +266,14 @@ extern "C" __global__ void fit(const __grid_constant__ Run r) {
   const bool together = r.turn == 0;
   const int kinds = together ? DIRECTIONS : 1, place = (together ? g : g / DIRECTIONS) % PLACES;
   const long long first = r.starts[g * kinds], last = r.starts[(g + 1) * kinds];
-  const auto weight_of = [](float score) { return min(0.5f * absolute(score), 1.0f); };
   double total = 0;
-  for (long long n = first; n < last; n++) total += weight_of(r.sampled[n]);
+  for (long long n = first; n < last; n++) total += torchdof::weight_of(r.sampled[n]);
   const float assumed = together ? torchdof::assumed_share(place) : r.shares[g / DIRECTIONS];
   float share = together ? torchdof::first_share(place) : 0.5f;
   for (int round = 0; round < torchdof::constants::edge_prior::ROUNDS; round++)
     share = torchdof::next_share(share, total, assumed, [&](float odds) {
       double near = 0;
-      for (long long n = first; n < last; n++) near += weight_of(r.sampled[n]) / (1 + odds * expf(-r.sampled[n]));
+      for (long long n = first; n < last; n++) near += torchdof::weight_of(r.sampled[n]) / (1 + odds * expf(-r.sampled[n]));
       return near;
     });
   (together ? r.shares : r.prior)[g] = share;

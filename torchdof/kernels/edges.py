@@ -11,11 +11,8 @@ from torch import Tensor
 
 from . import loader
 
-MOST_CHANNELS, MOST_ITEMS = 8, 4000
-
 _BLOCK = 128  # threads of a block for a list of pixels, as in edges.cu
 _WORK = 9  # planes of the work, as in edges.cu
-
 
 module, options = loader.by_channels("edges.cu"), loader.options
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from . import loader
 from .loader import Launch, pointer
 
-MOST_CHANNELS, MOST_SURFACES, MOST_ITEMS = 8, 4, 4000
+MOST_SURFACES = 4  # of a pixel
 
 _LAYERS = 16  # most layers of a launch
 _TILE_ROWS, _TILE_COLUMNS, _ROWS = 16, 32, 4  # as in frame.h
@@ -130,17 +130,16 @@ class Composite:
     Args:
         frame: The frame.
         surfaces: Its surfaces.
-        launch: The kernels; None takes those of the surfaces' device.
     """
 
-    def __init__(self, frame: Frame, surfaces: Sequence[Surface], launch: Launch | None = None) -> None:
+    def __init__(self, frame: Frame, surfaces: Sequence[Surface]) -> None:
         batch, channels, rows, columns = surfaces[0][0].shape
         self._colours = frame.kernels[0].shape[-3]
         self._items, self._channels = batch * self._colours, channels // self._colours
         self._frame, self._surfaces = frame, surfaces
         self._kernels = [kernel.contiguous() for kernel in frame.kernels]
         device = surfaces[0][0].device
-        self._launch = launch or module(self._channels, len(surfaces), frame.stacked, device.index or 0)
+        self._launch = module(self._channels, len(surfaces), frame.stacked, device.index or 0)
         self.steps = steps_of(frame, self._items, self._channels + 2)
         self._common = argument_type(len(surfaces))(
             ramps=frame.ramps.data_ptr(),

@@ -33,6 +33,8 @@ HEADERS = (
 _NO_STANDARD_LIBRARY = {"cstdint": "typedef long long int64_t;\ntypedef unsigned int uint32_t;\n"}
 _OPTIONS = ("--std=c++17", "--device-as-default-execution-space")
 
+MOST_CHANNELS, MOST_ITEMS = 8, 4000  # of a launch
+
 _TILE_ROWS, TILE_COLUMNS = 4, 32  # of a block of threads, as in pixel.h
 
 Launch = Callable[[str, Sequence[int], Sequence[int], ctypes.Structure], None]

@@ -35,8 +35,7 @@ struct Run {
   float *surfaces;         // [items, PLANES, height, width]
   const int *slots;        // place in the parts of a pixel at an edge, counted from 1, as coc
   float *parts;            // [OF_ENDS + 2 CHANNELS, count]
-  float *of_surfaces;      // as surfaces
-  const float *of_result;  // the same
+  const float *of_surfaces;  // as surfaces
   float *of_values;        // [items, VALUES, height, width]
   float *of_rows;          // of darkest and brightest, and how many pixels have this light: [items, 4 CHANNELS, height]
   const float *of_ends;    // the same of an item, [items, 4 CHANNELS]

@@ -10,12 +10,8 @@ import torch
 from torch import Tensor
 
 from . import loader
-from .loader import Launch
-
-MOST_CHANNELS, MOST_ITEMS = 8, 4000
 
 _TAPS = 9  # pixels around one, as in matting.h
-
 
 module, options = loader.by_channels("matting.cu"), loader.options
 
@@ -33,12 +29,11 @@ class Matting:
         light: ``[B, C, H, W]``.
         coc_px: ``[B, 1, H, W]``, signed.
         valid: ``[B, 1, H, W]``, 0 where a pixel is left out; None means all count.
-        launch: The kernels; None takes those of the images' device.
     """
 
-    def __init__(self, light: Tensor, coc_px: Tensor, valid: Tensor | None, launch: Launch | None = None) -> None:
+    def __init__(self, light: Tensor, coc_px: Tensor, valid: Tensor | None) -> None:
         self._light, self._coc = light, coc_px
-        self._launch = launch or module(light.shape[1], light.device.index or 0)
+        self._launch = module(light.shape[1], light.device.index or 0)
         self._darkest, self._brightest = light.flatten(2).aminmax(dim=2)  # of each channel
         self._edge, self._clean = torch.empty_like(coc_px), torch.empty_like(light)
         maps = {"light": light, "coc": coc_px, "valid": valid, "edge": self._edge}

@@ -41,7 +41,7 @@ import torch
 from torch import Tensor
 
 from .. import native
-from ..kernels import layers, matting
+from ..kernels import layers, loader
 from ..options import Options
 from ..tensors import is_differentiated, is_traced
 from ..validation import engine_reads
@@ -202,7 +202,7 @@ def _of_gpu(options: Options, maps: Sequence[Tensor], is_stack: bool) -> Route:
         (native.wanted() == "torch", "as TORCHDOF_ENGINE says"),
         (any(t.dtype != torch.float32 for t in maps), "the kernels compute in float32, and a map is float64"),
         (not options.occlusion, "without occlusion"),
-        (not on_gpu.takes(maps, 1, 1), _NO_MEMORY),
+        (not on_gpu.takes(maps), _NO_MEMORY),
     ):
         if is_refused:
             return Route("PyTorch", f"on {device}, {why}")
@@ -212,11 +212,11 @@ def _of_gpu(options: Options, maps: Sequence[Tensor], is_stack: bool) -> Route:
         (options.method != "layered", f"method={options.method!r}"),
         (options.table.depends_on_place, "the blur depends on the place in the frame"),
         (options.table.is_differentiated, "the aperture's rotation or squeeze has a gradient"),
-        (options.table.channels == 1 and channels > layers.MOST_CHANNELS, f"more than {layers.MOST_CHANNELS} channels"),
+        (options.table.channels == 1 and channels > loader.MOST_CHANNELS, f"more than {loader.MOST_CHANNELS} channels"),
         (surfaces > layers.MOST_SURFACES, f"a stack of more than {layers.MOST_SURFACES - 1} layers"),
     ):
         if has_no_kernels:
-            if is_stack or channels > matting.MOST_CHANNELS:
+            if is_stack or channels > loader.MOST_CHANNELS:
                 return Route("PyTorch", f"on {device}, {why}")
             return Route("kernels", f"float32 on {device}; PyTorch blurs the layers: {why}")
     return Route("kernels", f"float32 on {device}")

@@ -60,6 +60,9 @@ inline V direction(V right, V below, V gap) {
          (absolute(right) > absolute(below) + tie ? sign(right) : V{});
 }
 
+// What a sample with a score counts, 0 to 1.
+inline float weight_of(float score) { return min(0.5f * absolute(score), 1.0f); }
+
 // The share of the pixels of a place that is assumed to show the near surface, and where its first fit starts.
 inline float assumed_share(int place) {
   using namespace constants::edge_search;
@@ -82,6 +85,12 @@ inline float next_share(float share, double total, float assumed, const NearOf &
 template <typename V>
 inline V more_blurred(V near, V far) {
   return clamp01((absolute(near) - absolute(far)) / constants::edge_colours::MORE_BLURRED_PX);
+}
+
+// The factor on the squared difference between the colours of a pixel and a neighbour. square: of the pixel's colour.
+template <typename V>
+inline V per_light(V square) {
+  return 1.0f / (constants::edge_colours::SIMILAR * square + 1e-12f);
 }
 
 // How well colours separate the two surfaces of an edge, from sums over samples of both.
@@ -116,7 +125,7 @@ struct Separation {
     V spread = COLOUR_NOISE * noise + 1e-12f;
     spread += 0.5f * max(sum(2) * per_seen[0] - near_mean, V{});
     spread += 0.5f * max(sum(3) * per_seen[1] - far_mean, V{});
-    per_light = 1.0f / (SIMILAR * square + 1e-12f);
+    per_light = torchdof::per_light(square);
     per_spread = 1.0f / (SPREAD * spread);
     is_known = (seen[0] > LEAST_SEEN) & (seen[1] > LEAST_SEEN);
     reliability = is_known ? max(contrast / (contrast + 0.5f * spread) - INSEPARABLE, V{}) / (1.0f - INSEPARABLE) : one;

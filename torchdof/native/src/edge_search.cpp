@@ -250,8 +250,8 @@ class Search : EdgeMap {
     }
   }
 
-  // Kinds of LANES edge pixels. level: nearness, from 0 at the far surface to 1 at the near one; unsure: RINGS less the
-  // ring.
+  // Kinds of LANES edge pixels. level: nearness, from 0 at the far surface to 1 at the near one; unsure: RINGS + 1
+  // less the ring.
   static ivec kinds_at(const Maps &m, int y, int x, vec gap, vec level, vec is_ramp, vec unsure) {
     const vec none = {};
     const vec right = load<vec>(m.high.at(y, x + 2)) - load<vec>(m.high.at(y, x - 2));

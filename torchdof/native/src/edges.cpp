@@ -11,8 +11,8 @@
 #include "constants/edge_prior.h"
 #include "constants/edges.h"
 #include "edge_colours.h"
-#include "edge_rules.h"
 #include "edge_map.h"
+#include "edge_rules.h"
 #include "edge_search.h"
 #include "entry.h"
 #include "memory.h"
@@ -193,7 +193,7 @@ class Repair : Planes, EdgeMap {
         if (marks_[edge.i] & RAMP ? std::fabs(level - 0.5f) <= CLEAR_LEVEL
                                   : edge.kind / DIRECTIONS % RINGS != RINGS - 1)
           continue;
-        const float weight = std::min(0.5f * std::fabs(score), 1.0f);
+        const float weight = weight_of(score);
         const bool is_near = level > 0.5f;
         found.clear[is_near] += weight;
         if ((score > 0) == is_near) found.agreed[is_near] += weight;
@@ -232,7 +232,7 @@ class Repair : Planes, EdgeMap {
       for (size_t k = 0; k < group.edges.size(); k++) {
         const float score = group.judged[k].score;
         Observations &observed = observations[group.edges[k].kind];
-        observed.weights.push_back(std::min(0.5f * std::fabs(score), 1.0f));
+        observed.weights.push_back(weight_of(score));
         observed.odds.push_back(std::exp(-score));
       }
     for (Observations &observed : observations)

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from ... import native
-from ...kernels import edges, layers, matting, rays
+from ...kernels import edges, layers, loader, matting, rays
 from ...tensors import is_differentiated, is_in_memory, is_traced, without_autocast
 from ..layers.layer_weights import ramps
 from ..surfaces import edge_colours, edge_prior, edge_search
@@ -56,8 +56,7 @@ def composited(frame: PaddedFrame, kernels: Kernels, plain: Plain) -> Tensor | N
         return None
     maps, colours = maps_of(frame.surfaces), kernels[0][0].shape[-3]
     channels = frame.colours // colours
-    # the number of items last: a traced graph, which `takes` refuses, leaves it open
-    if not takes(maps, channels, len(frame.surfaces)) or len(maps[0]) * colours > layers.MOST_ITEMS:
+    if not takes(maps, channels, len(frame.surfaces), colours):
         return None
     variant = (channels, len(frame.surfaces), frame.stacked, maps[0].device.index or 0)
     return None if _missing(_layers_of_trial, plain, *variant) else _by_kernels(frame, kernels, plain)
@@ -72,9 +71,7 @@ def matte(
         ValueError: If they cannot be used and ``TORCHDOF_ENGINE`` is ``gpu``.
     """
     maps, channels = [t for t in (light, coc_px, valid, covered) if t is not None], light.shape[1]
-    # the number of items after `takes`, as in `composited`
-    is_taken = takes(maps, channels, 2) and len(light) <= matting.MOST_ITEMS
-    if not is_taken or _missing(_matte_of_trial, channels, light.device.index or 0):
+    if not takes(maps, channels) or _missing(_matte_of_trial, channels, light.device.index or 0):
         return plain_matte(light, coc_px, valid, ops, covered)
     surfaces = Matted(*_matte_by_kernels(light, coc_px, valid).split([channels, channels, 1, 1], 1))
     return surfaces if covered is None else with_covered(light, surfaces, covered)
@@ -86,7 +83,7 @@ def find_edges(light: Tensor, nearness: Tensor, valid: Tensor, step: Tensor) -> 
     Raises:
         ValueError: If they cannot be used and ``TORCHDOF_ENGINE`` is ``gpu``.
     """
-    if _has_no_edge_kernels(light, nearness):
+    if _has_no_edge_kernels(light.shape[1], nearness, light):
         return edge_search.find(nearness, valid, step)
     return _edges_by_kernels(light, nearness, valid, step)
 
@@ -99,7 +96,7 @@ def judge(
     Raises:
         ValueError: If they cannot be used and ``TORCHDOF_ENGINE`` is ``gpu``.
     """
-    if _has_no_edge_kernels(looks.colour[None], like):
+    if _has_no_edge_kernels(looks.colour.shape[0], like, looks.maps):
         return edge_colours.judge(looks, like, edge_pixels, sharpness, in_prior, mixtures, ops)
     return _judged_by_kernels(looks, like, edge_pixels, sharpness, in_prior, mixtures)
 
@@ -110,17 +107,14 @@ def calibrate(light: Tensor, kinds: Tensor, score: Tensor) -> Tensor:
     Raises:
         ValueError: If they cannot be used and ``TORCHDOF_ENGINE`` is ``gpu``.
     """
-    if _has_no_edge_kernels(light, score):
+    if _has_no_edge_kernels(light.shape[1], light, score):
         return edge_prior.calibrate(kinds, score, light.shape[0])
     return _calibrated_by_kernels(light, kinds, score)
 
 
-def _has_no_edge_kernels(light: Tensor, like: Tensor) -> bool:
-    """Whether PyTorch finds and judges edges, for light ``[B, C, ...]`` and a map of the frame."""
-    channels = light.shape[1]
-    # the number of items after `takes`, as in `composited`
-    is_taken = takes([light, like], channels, 1) and len(light) <= edges.MOST_ITEMS
-    return not is_taken or _missing(_edges_of_trial, channels, like.device.index or 0)
+def _has_no_edge_kernels(channels: int, *maps: Tensor) -> bool:
+    """Whether PyTorch finds and judges edges, for light of some channels and maps ``[B, ...]``."""
+    return not takes(maps, channels) or _missing(_edges_of_trial, channels, maps[0].device.index or 0)
 
 
 def blocked(plain: Callable[..., Tensor], *given: Any) -> Tensor:
@@ -131,17 +125,20 @@ def blocked(plain: Callable[..., Tensor], *given: Any) -> Tensor:
     """
     scale, fades, _, _, _, shown = given
     maps = (scale, fades, *shown)
-    is_taken = takes(maps, 1, 1) and not any(map(is_differentiated, maps))
+    is_taken = takes(maps) and not any(map(is_differentiated, maps))
     if not is_taken or _missing(_rays_of_trial, plain, scale.device.index or 0):
         return plain(*given)
     return _blocked_by_kernels(*given)
 
 
-def takes(maps: Sequence[Tensor], channels: int, surfaces: int) -> bool:
-    """Whether the kernels are wanted, and render maps with these numbers of channels and of surfaces in a pixel."""
+def takes(maps: Sequence[Tensor], channels: int = 1, surfaces: int = 1, colours: int = 1) -> bool:
+    """Whether the kernels are wanted and render maps ``[B, ...]`` of which B ``colours`` items have these channels.
+
+    ``surfaces`` is the number of surfaces in a pixel.
+    """
     if is_traced() or native.wanted() == "torch":
         return False
-    if channels > layers.MOST_CHANNELS or surfaces > layers.MOST_SURFACES:
+    if channels > loader.MOST_CHANNELS or surfaces > layers.MOST_SURFACES or len(maps[0]) * colours > loader.MOST_ITEMS:
         return False
     return all(t.dtype == torch.float32 and is_in_memory(t, backward=True, device=DEVICE) for t in maps)
 
