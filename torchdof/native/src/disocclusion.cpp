@@ -24,10 +24,10 @@ using namespace constants::disocclusion;  // render/surfaces/disocclusion.py giv
 constexpr int BAND = 8;                   // rows of a level computed together
 constexpr int CELL_LEVEL = 3;             // cells that may show hidden surfaces have the size of this level's samples
 
-// One level of a pyramid of the farthest surfaces. A sample has `stride` values: light of each channel, coc, weight,
-// padding.
+// One level of a pyramid of the farthest surfaces. A sample has `stride` values: `means`, light of each channel and
+// blur; coc, weight, padding.
 struct Level {
-  int height, width, step, stride, channels;
+  int height, width, step, stride, means;
   float vote;      // weight relative to other levels; 0: weights already contain it
   float least_px;  // blur above which a pixel reads this level; in full from twice this blur
   Buffer<float> values;
@@ -35,7 +35,7 @@ struct Level {
   float place_y(float y) const { return (y - centre_y) / step + 0.5f * (height - 1); }
   float place_x(float x) const { return (x - centre_x) / step + 0.5f * (width - 1); }
   float *at(int y, int x) const { return values.data() + ((size_t)y * width + x) * stride; }
-  float coc(int y, int x) const { return at(y, x)[channels]; }
+  float coc(int y, int x) const { return at(y, x)[means]; }
 };
 
 // While hidden surfaces are filled, the sign of a second surface's weight gives its kind: minus for a hidden surface,
@@ -73,18 +73,18 @@ struct Sample {
 
   // Reads the bilinear mean of the four samples around a position, without those in front of or at coc `here`.
   void read(const Level &level, Place row, Place column, float here) {
-    const int C = level.channels;
+    const int of_coc = level.means;
     level_weight = is_read(std::fabs(here), level.least_px);
     weight = 0;
     if (!(level_weight > 0)) return;
-    const float end = end_of_surface(here), down = row.part, right = column.part;
+    const float down = row.part, right = column.part;
     const float share[4] = {(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right};
     const float *corners[4];
     float total = 0, counts[4];
     for (int k = 0; k < 4; k++) {
       corners[k] =
           level.at(std::min(row.before + k / 2, level.height - 1), std::min(column.before + k % 2, level.width - 1));
-      total += counts[k] = share[k] * corners[k][C + 1] * is_another_surface(corners[k][C] - end);
+      total += counts[k] = share[k] * corners[k][of_coc + 1] * is_another_surface(corners[k][of_coc] - here);
     }
     if (!(total > LEAST_SEEN)) return;
     weight = total;
@@ -95,10 +95,10 @@ struct Sample {
   }
 };
 
-// Combines the samples of several levels: light and coc; returns the sum of their votes. With `farthest`, only the
-// farther of two surfaces counts.
+// Combines the samples of several levels: light, blur and coc; returns the sum of their votes. With `farthest`, only
+// the farther of two surfaces counts.
 float mix(const Level *levels, const Sample *samples, int n, bool farthest, float *out) {
-  const int C = levels->channels;
+  const int of_coc = levels->means;
   float total = 0;
   std::fill(out, out + levels->stride, 0.0f);
   for (int l = 0; l < n; l++) {
@@ -107,7 +107,7 @@ float mix(const Level *levels, const Sample *samples, int n, bool farthest, floa
     if (!(weight > 0)) continue;
     float vote = level_weight * (level.vote > 0 ? level.vote * std::min(weight / SURE, 1.0f) : weight);
     if (farthest) {
-      const float apart = ((const float *)samples[l].values.data())[C] - out[C];
+      const float apart = ((const float *)samples[l].values.data())[of_coc] - out[of_coc];
       if (total > 0) vote *= 1.0f - is_another_surface(-apart);
       total *= 1.0f - std::min(level_weight * weight / CERTAIN, 1.0f) * is_another_surface(apart);
     }
@@ -125,7 +125,8 @@ float mix(const Level *levels, const Sample *samples, int n, bool farthest, floa
 
 class Filling {
  public:
-  Filling(Job &job) : job_(job), s_(job.surfaces), C_(job.channels), stride_((job.channels + 2 + F8 - 1) / F8 * F8) {}
+  Filling(Job &job)
+      : job_(job), s_(job.surfaces), C_(job.channels), means_(C_ + 1), stride_((means_ + 2 + F8 - 1) / F8 * F8) {}
 
   // 1. Build the pyramid; each level keeps the farthest of the finer level's surfaces.
   // 2. Find the cells near which a farther surface exists.
@@ -147,7 +148,7 @@ class Filling {
       l.width = area_width_ >> (i + 1);
       l.step = 2 << i;
       l.stride = stride_;
-      l.channels = C_;
+      l.means = means_;
       centre(l);
       l.vote = (float)std::pow((double)FALL, i + 1);
       l.least_px = (float)std::pow(2.0, i - 1);
@@ -293,9 +294,14 @@ class Filling {
         vec sum = {};
         for (int j = 0; j < count; j++) sum += child[j] * counts[j];
         sum *= each;
-        put(k, k < C ? sum : total > vec{} ? sum : broadcast(-NEVER_PX));
+        if (k < C) {
+          put(k, sum);
+          continue;
+        }
+        put(C, absolute(sum));
+        put(means_, total > vec{} ? sum : broadcast(-NEVER_PX));
       }
-      put(C + 1, total);
+      put(means_ + 1, total);
     }
   }
 
@@ -308,18 +314,18 @@ class Filling {
         float farthest = -NEVER_PX, total = 0, counts[4], *out = level.at(y, x);
         for (int k = 0; k < 4; k++) {
           child[k] = fine.at(2 * y + k / 2, 2 * x + k % 2);
-          farthest = std::max(farthest, child[k][C_]);
+          farthest = std::max(farthest, child[k][means_]);
         }
         for (int k = 0; k < 4; k++)
-          total += counts[k] = child[k][C_ + 1] * (1.0f - is_another_surface(farthest - child[k][C_]));
+          total += counts[k] = child[k][means_ + 1] * (1.0f - is_another_surface(farthest - child[k][means_]));
         total *= 0.25f;
         for (float &count : counts) count *= 0.25f / std::max(total, LEAST_TOTAL);
-        for (int c = 0; c <= C_; c++)
+        for (int c = 0; c <= means_; c++)
           out[c] =
               child[0][c] * counts[0] + child[1][c] * counts[1] + child[2][c] * counts[2] + child[3][c] * counts[3];
-        if (!(total > 0)) out[C_] = -NEVER_PX;
-        out[C_ + 1] = total;
-        std::fill(out + C_ + 2, out + stride_, 0.0f);
+        if (!(total > 0)) out[means_] = -NEVER_PX;
+        out[means_ + 1] = total;
+        std::fill(out + means_ + 2, out + stride_, 0.0f);
       }
   }
 
@@ -369,7 +375,7 @@ class Filling {
     job_.behind_height = rows;
     job_.behind_width = columns;
     job_.behind.resize((size_t)C_ * rows * columns + 8);  // padding: eight values are read from any position
-    Level combined = {rows, columns, BEHIND_STEP, stride_, C_,
+    Level combined = {rows, columns, BEHIND_STEP, stride_, means_,
                       0,    0,       {},          0,       0};  // mean of the coarse levels behind cells
     centre(combined);
     if (levels > fine) {
@@ -414,7 +420,7 @@ class Filling {
     std::vector<double> sums(C_ + 1, 0.0);
     for (int row = 0; row < level.height; row++)
       for (int column = 0; column < level.width; column++) {
-        const float *sample = level.at(row, column), weight = sample[C_ + 1];
+        const float *sample = level.at(row, column), weight = sample[means_ + 1];
         if (!(weight > 0)) continue;
         for (int c = 0; c < C_; c++) sums[c] += (double)weight * sample[c];
         sums[C_] += weight;
@@ -434,13 +440,14 @@ class Filling {
     std::vector<Sample> samples(levels, {0, 0, std::vector<f8>(stride_ / F8)});
     for (int column = 0; column < columns; column++) {
       const float *light = base.at(row, column);
-      if (!(light[C + 1] > 0)) light = mean.data();
+      if (!(light[means_ + 1] > 0)) light = mean.data();
       float *const coarse_mean = coarse ? combined.at(row, column) : nullptr;
       if (coarse) memset(coarse_mean, 0, stride_ * sizeof(float));
       float nearest;
       if (is_wanted(row, column, rows, columns, nearest)) {
         for (int i = 0; i < levels; i++) samples[i].read(pyramid_[i], ys[i][row], xs[i][column], nearest);
-        if (coarse) coarse_mean[C + 1] = mix(&pyramid_[FINE_LEVELS], &samples[FINE_LEVELS], coarse, false, coarse_mean);
+        if (coarse)
+          coarse_mean[means_ + 1] = mix(&pyramid_[FINE_LEVELS], &samples[FINE_LEVELS], coarse, false, coarse_mean);
         if (mix(pyramid_.data(), samples.data(), levels, true, mean_behind.data()) > 0) light = mean_behind.data();
       }
       const size_t at = (size_t)row * columns + column;
@@ -507,17 +514,16 @@ class Filling {
   }
 
   // Mean of the samples behind LANES pixels: vector v of row y of the cell at column x0, with the coc `here`. Returns
-  // the sum of the votes; mean: light and coc.
+  // the sum of the votes; mean: light, blur and coc.
   template <int CHANNELS>
   vec mean_behind(const CellLevels &to, const int *first_rows, vec here, int y, int x0, int v, int columns,
                   vec *mean) const {
     constexpr int VECTORS = CELL / LANES, ROWS = CELL / 2 + 2;
-    const int C = CHANNELS ? CHANNELS : C_, planes = C + 2;
+    const int means = (CHANNELS ? CHANNELS : C_) + 1, planes = means + 2;
     const size_t beside = (size_t)planes * VECTORS, below = 2 * beside, of_level = ROWS * below;
     const vec size = max(here, -here);
-    const vec end = end_of_surface(here);
     vec total = {};
-    for (int k = 0; k <= C; k++) mean[k] = vec{};
+    for (int k = 0; k <= means; k++) mean[k] = vec{};
     for (int i = to.first; i < to.count; i++) {
       const Level &level = *to.levels[i];
       const Place row = to.ys[i][y], *xs = &to.xs[i][x0];
@@ -531,8 +537,8 @@ class Filling {
       const vec left = 1.0f - right,
                 shares[4] = {left * (1.0f - row.part), right * (1.0f - row.part), left * row.part, right * row.part};
       for (int k = 0; k < 4; k++) {
-        const vec farther = is_another_surface(corners[k][C * VECTORS] - end);
-        weight += counts[k] = shares[k] * corners[k][(C + 1) * VECTORS] * farther;
+        const vec farther = is_another_surface(corners[k][means * VECTORS] - here);
+        weight += counts[k] = shares[k] * corners[k][(means + 1) * VECTORS] * farther;
       }
       const vec level_weight = is_read(size, level.least_px);
       const ivec is_seen = (weight > LEAST_SEEN) & (level_weight > vec{});
@@ -542,7 +548,7 @@ class Filling {
       total += vote;
       const vec part = vote / max(total, broadcast(LEAST_TOTAL)), each = 1.0f / max(weight, broadcast(LEAST_SEEN));
       for (vec &count : counts) count *= each;
-      for (int k = 0; k <= C; k++) {
+      for (int k = 0; k <= means; k++) {
         const size_t plane = (size_t)k * VECTORS;
         const vec sample = corners[0][plane] * counts[0] + corners[1][plane] * counts[1] +
                            corners[2][plane] * counts[2] + corners[3][plane] * counts[3];
@@ -560,7 +566,7 @@ class Filling {
   template <int CHANNELS>
   void fill_cell(int y0, int x0, CellLevels &to) {
     constexpr int VECTORS = CELL / LANES, ROWS = CELL / 2 + 2;
-    const int C = CHANNELS ? CHANNELS : C_, planes = C + 2, W = job_.width,
+    const int C = CHANNELS ? CHANNELS : C_, planes = C + 3, W = job_.width,
               which = y0 / BLOCK * s_.block_columns + x0 / BLOCK;
     const int rows = std::min(CELL, job_.height - y0), columns = std::min(CELL, W - x0);
     const size_t of_level = (size_t)2 * ROWS * planes * VECTORS;
@@ -587,11 +593,12 @@ class Filling {
         // replaces a second surface to which matting gave a small weight
         const Block b = s_.make_block(which);
         const size_t at = within + v * LANES;
-        const vec mixed = load<vec>(b.weight + at), certain = min(total * (1.0f / CERTAIN), broadcast(1.0f));
+        const vec mixed = load<vec>(b.weight + at),
+                  certain = min(total * (1.0f / CERTAIN), broadcast(1.0f)) * on_one_side(mean[C + 1], mean[C]);
         const vec hidden = as_hidden(certain * (HIDDEN_WEIGHT - 2.0f * mixed));
         auto replace = [&](float *other, vec hidden_one) { store(other, wanted ? hidden_one : load<vec>(other)); };
         for (int c = 0; c < C; c++) replace(b.other + c * BLOCK_PIXELS + at, mean[c]);
-        replace(b.coc + at, mean[C]);
+        replace(b.coc + at, mean[C + 1]);
         vec valid = broadcast(1.0f);
         for (int x = 0; s_.valid && x < std::min(LANES, columns - v * LANES); x++)
           valid[x] = s_.valid[s_.pixel(y0 + y, x0 + v * LANES + x)];
@@ -602,7 +609,7 @@ class Filling {
 
   Job &job_;
   Surfaces &s_;
-  const int C_, stride_;
+  const int C_, means_, stride_;
   int area_height_, area_width_, coarsest_, cell_, cell_rows_, cell_columns_;
   std::vector<Level> pyramid_;
   std::vector<uint8_t> found_, fine_;  // of each cell: a farther surface exists; a fine level has it

@@ -15,7 +15,7 @@ namespace torchdof {
 
 // Constants of Python modules, which give their meanings, units and effects.
 using constants::composite::KNOWN;
-using constants::disocclusion::BEHIND_PX, constants::disocclusion::OWN_SLOPE;
+using constants::disocclusion::BEHIND_PX, constants::disocclusion::OF_MEAN;
 using constants::doubt::APART_PX, constants::doubt::SHARPER;
 using constants::frame::AT_FOCUS, constants::frame::OFF_FOCUS, constants::frame::BARELY_BLURRED;
 using constants::frame::CONTINUES_FROM, constants::frame::COUNTED, constants::frame::HIDDEN_WEIGHT;
@@ -71,14 +71,11 @@ inline V unlimited_sided(V sided) {
   return PLACE_SLOPE * (sided - SIDED_FROM);
 }
 
-// Largest coc of a pixel's own surface nearby, which may slope: c + max(OWN_SLOPE |c| - BEHIND_PX, 0); and its
-// derivative. render/surfaces/disocclusion.py, end_of_surface.
+// Confidence that samples with the mean coc c and the mean blur b lie on one side of the focus: clamp(1 + OF_MEAN |c| -
+// b, 0, 1). render/surfaces/disocclusion.py, _on_one_side.
 template <typename V>
-inline V end_of_surface(V coc) {
-  return coc + max(absolute(coc) * OWN_SLOPE - BEHIND_PX, V{});
-}
-inline float slope_of_end(float coc) {
-  return OWN_SLOPE * absolute(coc) >= BEHIND_PX ? 1.0f + (coc < 0 ? -OWN_SLOPE : OWN_SLOPE) : 1.0f;
+inline V on_one_side(V coc, V blur) {
+  return clamp01(1.0f + OF_MEAN * absolute(coc) - blur);
 }
 
 // Confidence that a surface whose coc is larger by d is another surface: clamp(d - BEHIND_PX + 1/2, 0, 1).

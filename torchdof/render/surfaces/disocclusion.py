@@ -25,11 +25,8 @@ from .emitters import attribute_emitters
 from .frame import HIDDEN_WEIGHT, Surface
 from .matting import NEVER_PX, Matted
 
-# Another surface, or a slope of the pixel's own one; larger values of both: fewer hidden samples
-_BEHIND_PX = (
-    1.0  # px; difference in coc at which a sample lies on another surface with confidence 1/2; 1 at 1/2 px more
-)
-_OWN_SLOPE = 0.25  # part of a pixel's blur by which its own surface may be farther nearby
+_BEHIND_PX = 1.0
+"""Difference in coc at which a sample lies on another surface with confidence 1/2; 1 at 1/2 px more."""
 
 # Levels of the pyramid
 _FALL = 0.35  # weight of a level relative to the next finer one; larger: hidden areas are smoother
@@ -39,6 +36,7 @@ _LEAST_SEEN = 1e-4  # weight of samples up to which they count as empty
 _LEAST_TOTAL = 1e-9  # smallest divisor of sums of light
 _MIXED = 0.05  # share above which the second surface of a pixel counts; larger: fewer mixed pixels
 _HIDING_FROM_PX = 0.5  # px: pixels blurred less hide nothing that is seen
+_OF_MEAN = 4.0  # mean blur, over the mean coc, from which a hidden sample fades; larger: more sharp specks
 _CERTAIN = 0.01  # votes at which a hidden sample has full weight, or a farther surface replaces a nearer one
 
 BEHIND_STEP = 2**_FINE_LEVELS
@@ -117,12 +115,6 @@ def _operator(
 def is_another_surface(distance_px: Tensor) -> Tensor:
     """Confidence, 0 to 1, that a surface farther by ``distance_px`` of coc is another surface."""
     return (distance_px - _BEHIND_PX + 0.5).clamp(0.0, 1.0)
-
-
-def end_of_surface(coc_px: Tensor) -> Tensor:
-    """Largest coc of a pixel's own surface nearby, which may slope, of the coc of the pixel."""
-    slope = _OWN_SLOPE if active().own_slope else 0.0
-    return coc_px + (slope * coc_px.abs() - _BEHIND_PX).clamp_min(0.0)
 
 
 def is_read(coc_px: Tensor, least_px: float | Tensor) -> Tensor:
@@ -216,7 +208,10 @@ def _surfaces_of_image(
     hidden = (total * (-HIDDEN_WEIGHT / _CERTAIN)).clamp_min(-HIDDEN_WEIGHT) * mixed.clamp(max=0.0)
     if not active().filling:
         hidden = torch.zeros_like(hidden)
-    is_hidden, (seen_light, seen_coc) = hidden > 0, seen.split([light.shape[1], 1], 1)
+    seen_light, blur, seen_coc = seen.split([light.shape[1], 1, 1], 1)
+    if active().one_side:
+        hidden = hidden * _on_one_side(seen_coc, blur)
+    is_hidden = hidden > 0
     other = torch.where(is_hidden, seen_light, other)
     other_coc = torch.where(is_hidden, seen_coc, other_coc)
     own_weight, other_weight = 1.0 - counted, hidden + counted
@@ -228,12 +223,16 @@ def _surfaces_of_image(
 def _pyramid(
     matted: Matted, coc_px: Tensor, threshold: Tensor, valid: Tensor | None, levels: Sequence[int]
 ) -> list[Level]:
-    """Step 3 of :func:`surfaces_of_image`: the farthest surfaces of an image, fine to coarse, centred on it."""
+    """Step 3 of :func:`surfaces_of_image`: the farthest surfaces of an image, fine to coarse, centred on it.
+
+    Their blur, the magnitude of the coc, is one more channel of the light, ``[B, C + 3, h, w]``.
+    """
     own, other, other_coc, other_weight = matted
     sizes = [[_continued(n, 2**level) for level in levels] for n in coc_px.shape[-2:]]
     rows, columns = (max(of_items) // 2 for of_items in sizes)
     maps = [own, coc_px, other, other_coc, other_weight, threshold, *([] if valid is None else [valid])]
-    pyramid = [_repeated(finest_level((rows, columns), *maps), sizes, 1)]
+    light, coc_px, weight = finest_level((rows, columns), *maps).split([own.shape[1], 1, 1], 1)
+    pyramid = [_repeated(torch.cat([light, coc_px.abs(), coc_px, weight], 1), sizes, 1)]
     for level in range(2, max(levels) + 1):
         pyramid.append(_repeated(coarser_level(pyramid[-1]), sizes, level))
     # a pixel reads a level from a blur of a quarter of its step on
@@ -254,11 +253,19 @@ def _light_behind(pyramid: Sequence[Level], coc_px: Tensor, wanted: Tensor, ops:
     far_light, _, far_weight = of_cells.split(parts, 1)
     mean = (far_light * far_weight).sum((-2, -1), keepdim=True)
     mean = mean / far_weight.sum((-2, -1), keepdim=True).clamp_min(1e-12)
-    behind = torch.where(votes > 0, behind, torch.where(far_weight > 0, far_light, mean))
+    behind = torch.where(votes > 0, behind, torch.where(far_weight > 0, far_light, mean))[:, :-1]
     if not coarse:
         return behind, pyramid
     cells = Level(of_coarse[0], BEHIND_STEP, coarse[0].least_px, 1.0, math.inf)
     return behind, [*pyramid[:_FINE_LEVELS], cells]
+
+
+def _on_one_side(coc_px: Tensor, blur_px: Tensor) -> Tensor:
+    """Confidence, 0 to 1, that samples lie on one side of the focus, of their mean coc and their mean blur.
+
+    Both are equal in magnitude then. The mean of samples on both sides could be 0, a sharp speck.
+    """
+    return (1.0 + _OF_MEAN * coc_px.abs() - blur_px).clamp(0.0, 1.0)
 
 
 def _repeated(values: Tensor, sizes: Sequence[Sequence[int]], level: int) -> Tensor:
@@ -475,8 +482,7 @@ def counted_behind(samples: Tensor, share: Tensor, coc_px: Tensor, channels: int
     """
     count = samples.shape[channels] - 2
     coc, weight = samples.narrow(channels, count, 1), samples.narrow(channels, count + 1, 1)
-    # the pixel's own surface may slope nearby by a part of its blur
-    part = share * weight * is_another_surface(coc - end_of_surface(coc_px))
+    part = share * weight * is_another_surface(coc - coc_px)
     return samples.narrow(channels, 0, count + 1) * part, part
 
 
