@@ -35,6 +35,7 @@ RULES: dict[str, Callable[[Tensor], Tensor]] = {
     "ramp(x, false)": lambda x: x.clamp(0.0, 1.0),
     "continuation(v)[0]": frame.continuation_weight,
     "visible_part(v)[0]": frame.visible_part,
+    "end_of_surface(v)[0]": frame.end_of_surface,
     "at_focus(v)[0]": frame.at_focus,
     "stands_in(v)[0]": frame.stands_in,
     "counts(v)[0]": frame.counts,
@@ -47,6 +48,7 @@ SLOPES: dict[str, str] = {
     "slope_of_ramp(v, false)[0]": "ramp(x, false)",
     "slope_of_continuation(v)[0]": "continuation(v)[0]",
     "slope_of_visible_part(v)[0]": "visible_part(v)[0]",
+    "slope_of_end(v)[0]": "end_of_surface(v)[0]",
     "slope_of_at_focus(v)[0]": "at_focus(v)[0]",
     "slope_of_stands_in(v)[0]": "stands_in(v)[0]",
     "slope_of_counts(v)[0]": "counts(v)[0]",
@@ -124,6 +126,7 @@ def test_rules_at_points_computed_by_hand() -> None:
     assert frame.visible_part(torch.tensor([0.0, 0.03, 0.5])).tolist() == pytest.approx([1.0, 0.5, 0.0])
     cover = torch.tensor([0.003, 0.053, 0.6])
     assert frame.continuation_weight(cover).tolist() == pytest.approx([0.0, 0.4735, 0.4])
+    assert frame.end_of_surface(torch.tensor([-8.0, -1.0, 0.0, 4.0])).tolist() == [-4.0, 0.0, 1.0, 6.0]
     assert frame.at_focus(torch.tensor([-1.0, -0.1, 0.0, 5.0])).tolist() == pytest.approx([0.0, 0.75, 1.0, 1.0])
     assert frame.stands_in(torch.tensor([-3.5, -2.25, -1.0, -0.0125, 1.0])).tolist() == pytest.approx(
         [0, 0.5, 1, 0.25, 0]

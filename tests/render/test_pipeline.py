@@ -9,7 +9,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from tests.refused import refuses
-from torchdof import Camera, DepthOfField
+from torchdof import Camera, DepthOfField, blur_by_coc
 from torchdof.reference import metrics
 from torchdof.reference.scenes import Plane, Scene, plane_scene, posts, waves
 
@@ -17,6 +17,7 @@ CAMERA = Camera.from_fov(40.0, 0.09, 3.0)
 DEPTHS = (6.0, 2.0, 1.2)
 SHAPES = (None, posts(90, 30), posts(140, 25, -0.2))
 PLANES = [Plane(z, waves(i), shape) for i, (z, shape) in enumerate(zip(DEPTHS, SHAPES, strict=True))]
+CLOSE = [Plane(z, waves(i), shape) for i, (z, shape) in enumerate(zip((3.2, 2.9, 1.2), SHAPES, strict=True))]
 
 
 @cache
@@ -103,3 +104,22 @@ test_a_background_or_stack_that_does_not_fit_is_refused = refuses(
     (stacked(RGBA + 1.5, torch.ones(2)), "coverage"),
     (partial(SUM.layers, RGBA, torch.ones(2)), "occlusion=True"),
 )
+
+
+@pytest.mark.parametrize("slope_px", [0.02, 0.1, 0.2])
+def test_a_known_background_does_not_shine_through_a_slope(slope_px: float, engine: str) -> None:
+    """Neither between the layers of a dark surface, which has another blur in each column, nor at steps of a file."""
+    coc = (slope_px * torch.arange(72.0) - 3.2).clamp(max=3.0)
+    coc = torch.cat([torch.full([24], 60.0), coc]).expand(1, 1, 64, 96)
+    light = torch.where(coc == 60.0, 1.0, 0.01)
+    known = {"background": torch.ones_like(light), "background_coc_px": torch.full_like(coc, 60.0)}
+    blurred = partial(blur_by_coc, light, depth_edges="as given", **known)
+    for levels in (coc, (4.0 * coc).round() / 4.0):
+        assert float(blurred(levels)[..., 34:60].max()) < 0.021  # 0.17
+
+
+def test_a_surface_just_in_front_of_another_one_hides_it() -> None:
+    """Of the wall, and of posts just in front of it, the blur differs by 0.6 px."""
+    scene = plane_scene(CLOSE, CAMERA.replace(focus_m=1.2), (110, 150), samples=64)
+    dof = DepthOfField(scene.camera, tolerance=0)
+    assert psnr(scene, dof.layers(layers(), torch.tensor([3.2, 2.9, 1.2]))[:, :3]) > 55.0  # 48.7

@@ -200,29 +200,32 @@ extern "C" __global__ void __launch_bounds__(TILE_ROWS * TILE_COLUMNS) terms_bac
   if (first < 0) return;
   const int at = first + pixel_row() % r.scale * r.frame_columns + pixel_column() % r.scale;
   const Pixel p = pixel_of(r, item, at);
-  float of_light[SURFACES][CHANNELS] = {}, of_place[SURFACES] = {}, of_weight[SURFACES] = {};
-  for (int i = 0; i < r.layers; i++) {
-    if (!r.read[tile_at(r, item, i, y / TILE_ROWS, x / TILE_COLUMNS)]) continue;
-    const float *of_terms = r.terms + ((long long)item * r.layers + i) * VALUES * area_of_grid(r) + y * r.columns + x;
-    const Ramps l = ramps_of(r, item, i);
-    const Weights w = weigh(l, p);
+  const float each = 1.0f / (r.scale * r.scale);
+  const auto each_layer = [&](const auto &use) {
+    for (int i = 0; i < r.layers; i++)
+      if (r.read[tile_at(r, item, i, y / TILE_ROWS, x / TILE_COLUMNS)])
+        use(ramps_of(r, item, i), r.terms + ((long long)item * r.layers + i) * VALUES * area_of_grid(r) + y * r.columns + x);
+  };
+  {  // the light first, because all gradients together need more registers than there are
+    float of_light[SURFACES][CHANNELS] = {};
+    each_layer([&](const Ramps &l, const float *of_terms) {
+      const Weights w = weigh(l, p);
+      for (int c = 0; c < CHANNELS; c++)
+        for (int j = 0; j < SURFACES; j++) of_light[j][c] += of_terms[c * area_of_grid(r)] * w.own[j];
+    });
+    for (int j = 0; j < SURFACES; j++)
+      for (int c = 0; c < CHANNELS; c++) (p.swapped ? r.of_light[SURFACES - 1 - j] : r.of_light[j])[light_at(r, item, c, at)] += of_light[j][c] * each;
+  }
+  float of_place[SURFACES] = {}, of_weight[SURFACES] = {};
+  each_layer([&](const Ramps &l, const float *of_terms) {
     Weights of = {{}, of_terms[BEYOND * area_of_grid(r)]};
     for (int j = 0; j < SURFACES; j++) {
       of.own[j] = of_terms[OWN * area_of_grid(r)];
-      for (int c = 0; c < CHANNELS; c++) {
-        const float slope = of_terms[c * area_of_grid(r)];
-        of.own[j] += slope * light_of(r, p, j, light_at(r, item, c, at));
-        of_light[j][c] += slope * w.own[j];
-      }
+      for (int c = 0; c < CHANNELS; c++) of.own[j] += of_terms[c * area_of_grid(r)] * light_of(r, p, j, light_at(r, item, c, at));
     }
     weigh_back(l, p, of, of_place, of_weight);
-  }
-  const float each = 1.0f / (r.scale * r.scale);
-  for (int j = 0; j < SURFACES; j++) {
-    of_place[j] *= each;
-    of_weight[j] *= each;
-    for (int c = 0; c < CHANNELS; c++) (p.swapped ? r.of_light[SURFACES - 1 - j] : r.of_light[j])[light_at(r, item, c, at)] += of_light[j][c] * each;
-  }
+  });
+  for (int j = 0; j < SURFACES; j++) of_place[j] *= each, of_weight[j] *= each;
   add_to(r, item, at, p, of_place, of_weight);
 }
 

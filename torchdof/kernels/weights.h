@@ -13,25 +13,33 @@ struct Weights {
 
 #if STACKED
 // Surfaces that cover a pixel independently, near to far; the formula of _stacked in render/surfaces/frame.py. Of surface j: its
-// share a at or behind the layer, and b behind it; h, the part of the light from behind that the surface hides in this layer and
-// those behind it; hidden, the part that its part in front of the layer hides; s, the part of the arriving light that stops in the layer.
+// h, the part of the light from behind that it hides in this layer and those behind it; passes, the part that its part in front of the
+// layer lets pass; s, the part of the arriving light that stops in the layer.
 struct Stack {
-  float a[SURFACES], b[SURFACES], h[SURFACES], hidden[SURFACES], s[SURFACES];
+  float h[SURFACES], passes[SURFACES], s[SURFACES];
+  // What the surfaces let pass, without one of them.
+  __device__ float visible(int without = -1) const {
+    float left = 1;
+    for (int j = 0; j < SURFACES; j++) left *= j == without ? 1 : passes[j];
+    return left;
+  }
 };
+// The share of a surface at or behind a layer, nearby; and how far it hides the light from behind.
+__device__ inline float unlimited_nearby(const Ramps &l, float place) { return l.at_or_behind(end_of_surface(place)); }
+__device__ inline float hides(float nearby) { return ramp(clamp01(nearby) / HIDING_SHARE, true); }
 __device__ inline Stack stack_of(const Ramps &l, const Pixel &p) {
   Stack t;
   for (int j = 0; j < SURFACES; j++) {
-    t.a[j] = ramp(l.at_or_behind(p.place[j]), true);
-    t.b[j] = ramp(l.behind(p.place[j]), true);
-    t.h[j] = p.weight[j] * ramp(t.a[j] / HIDING_SHARE, true);
-    t.hidden[j] = t.h[j] * (1 - t.a[j]);
-    t.s[j] = p.weight[j] * (t.a[j] - t.b[j]) / torchdof::max(1 - t.hidden[j], LEAST_PASSING);
+    const float at_or_behind = ramp(l.at_or_behind(p.place[j]), true), share = at_or_behind - ramp(l.behind(p.place[j]), true);
+    t.h[j] = p.weight[j] * hides(unlimited_nearby(l, p.place[j]));
+    t.passes[j] = 1 - t.h[j] + t.h[j] * at_or_behind;
+    t.s[j] = p.weight[j] * share / torchdof::max(t.passes[j], LEAST_PASSING);
   }
   return t;
 }
 __device__ inline Weights weigh(const Ramps &l, const Pixel &p) {
   const Stack t = stack_of(l, p);
-  const float visible = left_by(t.hidden, SURFACES, -1);
+  const float visible = t.visible();
   Weights w = {{}, visible * (1 - left_by(t.h, SURFACES, -1))};
   float arriving = 1;
   for (int j = 0; j < SURFACES; j++) {
@@ -44,19 +52,21 @@ __device__ inline Weights weigh(const Ramps &l, const Pixel &p) {
 // Adds the gradients by places and weights.
 __device__ inline void weigh_back(const Ramps &l, const Pixel &p, const Weights &of, float *of_place, float *of_weight) {
   const Stack t = stack_of(l, p);
-  const float visible = left_by(t.hidden, SURFACES, -1), known = 1 - left_by(t.h, SURFACES, -1);
-  float of_visible = of.beyond * known, of_arriving = 0;  // of_arriving: by the light that arrives at the next surface
+  const float visible = t.visible(), of_known = of.beyond * visible;
+  float of_visible = of.beyond * (1 - left_by(t.h, SURFACES, -1)), of_arriving = 0;  // of_arriving: by the light that arrives at the next surface
   for (int j = 0; j < SURFACES; j++) of_visible += (of.own[j] - of.beyond) * left_by(t.s, j, -1) * t.s[j];
   for (int j = SURFACES - 1; j >= 0; j--) {
-    const float of_stopped = (of.own[j] - of.beyond) * visible, passing = torchdof::max(1 - t.hidden[j], LEAST_PASSING);
+    const float of_stopped = (of.own[j] - of.beyond) * visible, passing = torchdof::max(t.passes[j], LEAST_PASSING);
     const float of_s = left_by(t.s, j, -1) * (of_stopped - of_arriving), of_difference = of_s * p.weight[j] / passing;
     of_arriving = of_stopped * t.s[j] + (1 - t.s[j]) * of_arriving;
-    const float of_hidden = (1 - t.hidden[j] >= LEAST_PASSING ? of_s * t.s[j] / passing : 0.0f) - of_visible * left_by(t.hidden, SURFACES, j);
-    const float of_h = of_hidden * (1 - t.a[j]) + of.beyond * visible * left_by(t.h, SURFACES, j), nearer = t.a[j] / HIDING_SHARE;
-    const float of_a = of_difference - of_hidden * t.h[j] + of_h * p.weight[j] * slope_of_ramp(nearer, true) / HIDING_SHARE;
-    of_place[j] += of_a * slope_of_ramp(l.at_or_behind(p.place[j]), true) / l.width;
+    const float at_or_behind = ramp(l.at_or_behind(p.place[j]), true), share = at_or_behind - ramp(l.behind(p.place[j]), true);
+    const float of_passes = of_visible * t.visible(j) - (t.passes[j] >= LEAST_PASSING ? of_s * t.s[j] / passing : 0.0f);
+    const float of_h = of_passes * (at_or_behind - 1) + of_known * left_by(t.h, SURFACES, j), near = unlimited_nearby(l, p.place[j]);
+    const float of_near = within(near) ? of_h * p.weight[j] * slope_of_ramp(near / HIDING_SHARE, true) / HIDING_SHARE : 0.0f;
+    of_place[j] += (of_difference + of_passes * t.h[j]) * slope_of_ramp(l.at_or_behind(p.place[j]), true) / l.width;
+    of_place[j] += of_near * slope_of_end(p.place[j]) / l.width;
     of_place[j] -= of_difference * slope_of_ramp(l.behind(p.place[j]), true) / l.next_width;
-    of_weight[j] += of_s * (t.a[j] - t.b[j]) / passing + of_h * ramp(nearer, true);
+    of_weight[j] += of_s * share / passing + of_h * hides(near);
   }
 }
 #else

@@ -20,6 +20,7 @@ using constants::doubt::APART_PX, constants::doubt::SHARPER;
 using constants::frame::AT_FOCUS, constants::frame::OFF_FOCUS, constants::frame::BARELY_BLURRED;
 using constants::frame::CONTINUES_FROM, constants::frame::COUNTED, constants::frame::HIDDEN_WEIGHT;
 using constants::frame::HIDING_SHARE, constants::frame::LEAST_PASSING, constants::frame::SEEN_FROM;
+using constants::frame::SLOPES, constants::frame::SLOPES_LEAST;
 using constants::matting::ON_FAR_TO, constants::matting::ON_NEAR_FROM, constants::matting::PLACE_SLOPE;
 using constants::matting::SAME_BLUR, constants::matting::SIDED_FROM;
 constexpr float FOOT = constants::layer_weights::FOOT;
@@ -165,6 +166,17 @@ inline V visible_part(V nearer) {
 template <typename V>
 inline V slope_of_visible_part(V nearer) {
   return within(nearer * (1.0f / HIDING_SHARE)) ? V{} - 1.0f / HIDING_SHARE : V{};
+}
+
+// Farthest place at which a stacked surface may continue nearby: x + max(SLOPES |x|, SLOPES_LEAST); and its derivative.
+// render/surfaces/frame.py, end_of_surface.
+template <typename V>
+inline V end_of_surface(V place) {
+  return place + max(SLOPES * absolute(place), V{} + SLOPES_LEAST);
+}
+template <typename V>
+inline V slope_of_end(V place) {
+  return 1.0f + (SLOPES * absolute(place) < V{} + SLOPES_LEAST ? V{} : place < V{} ? V{} - SLOPES : V{} + SLOPES);
 }
 
 // Stand-ins for the background, each rule with its derivative. A surface at x counts as one at the focus by clamp(1 + x

@@ -23,6 +23,8 @@ HIDDEN_WEIGHT = 0.003
 
 _HIDING_SHARE = 0.06
 """Share of a surface at or behind a layer at which it counts there in full; larger: it fades in over more depth."""
+_SLOPES, _SLOPES_LEAST = 0.5, 1.0
+"""A stacked surface may be farther nearby by this part of its place on the blur axis, and by this at least."""
 _LEAST_PASSING = 1e-6  # smallest divisor: share of the light that passes the part of a surface in front of a layer
 _CONTINUES_FROM = 0.1
 """Visible share of a far surface, above HIDDEN_WEIGHT, at which it continues in full behind the near one."""
@@ -157,13 +159,16 @@ class PaddedFrame:
         Returns light ``m_k I``, ``[B, n, C, h, w]``, its weight ``m_k`` and the weight behind it ``M_k - m_k``,
         ``[B, n, 1, h, w]``.
         """
-        ramps, pairs = self.ramps[..., first : first + count + 1], []
+        ramps, pairs, nearby = self.ramps[..., first : first + count + 1], [], []
         for surface in self.surfaces:  # one after the other: on a CPU their maps then stay in its caches
-            weights = weights_at_or_behind(self.cut(surface.x, halo), ramps)
+            x = self.cut(surface.x, halo)
+            weights = weights_at_or_behind(x, ramps)
             weights = (eased(weights) if self.occlusion else weights).unsqueeze(2)
             pairs.append((weights[:, :-1], weights[:, 1:]))
+            if self.stacked:
+                nearby.append(weights_at_or_behind(end_of_surface(x), ramps[..., :-1]).unsqueeze(2))
         surfaces = [PaddedSurface(*(self.cut(t.unsqueeze(1), halo) for t in s if t is not None)) for s in self.surfaces]
-        return (_stacked if self.stacked else _mixed)(surfaces, pairs)
+        return _stacked(surfaces, pairs, nearby) if self.stacked else _mixed(surfaces, pairs)
 
     def stand_ins(self) -> tuple[Tensor, Tensor]:
         """Stand-ins for the picture at and behind the focus: light ``[B, C, h, w]`` and cover ``[B, 1, h, w]``.
@@ -246,26 +251,32 @@ def _mixed(surfaces: Sequence[PaddedSurface], pairs: Sequence[tuple[Tensor, Tens
     return sums[0], sums[1], sums[2]
 
 
+def end_of_surface(x: Tensor) -> Tensor:
+    """Farthest place at which a stacked surface at places ``x`` may continue nearby, as one that slopes does."""
+    return x + (_SLOPES * x.abs()).clamp_min(_SLOPES_LEAST)
+
+
 def _stacked(
-    surfaces: Sequence[PaddedSurface], pairs: Sequence[tuple[Tensor, Tensor]]
+    surfaces: Sequence[PaddedSurface], pairs: Sequence[tuple[Tensor, Tensor]], nearby: Sequence[Tensor]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """``m_k I``, ``m_k`` and ``M_k - m_k`` of surfaces that cover a pixel independently, near to far.
 
-    With ``c`` the cover of a surface, ``b`` its share at or behind layer k, ``f`` the share :data:`_HIDING_SHARE` and
-    ``h = c eased(min(b / f, 1))``,
+    With ``c`` the cover of a surface, ``b`` its share at or behind layer k, ``n`` the same share of
+    :func:`end_of_surface`, ``f`` the share :data:`_HIDING_SHARE` and ``h = c eased(min(n / f, 1))``,
 
         ``M_k = prod(1 - h (1 - b)) (1 - prod(1 - h))``,
 
     products over the surfaces: the known part of the pixel at or behind layer k, less the parts of the same surfaces
-    in front of it.
+    in front of it, behind which light from farther surfaces would pass between the layers of a slope.
     """
     visible = torch.ones_like(surfaces[0].x)
     arriving = unknown = visible
     stopped = []
-    for (_, x, weight), (behind, beyond) in zip(surfaces, pairs, strict=True):
+    for (_, x, weight), (behind, beyond), near in zip(surfaces, pairs, nearby, strict=True):
         cover = torch.ones_like(x) if weight is None else weight
-        here = cover * eased((behind / _HIDING_SHARE).clamp(max=1.0))
-        passes = 1.0 - here * (1.0 - behind)  # share not hidden by the surface's part in front of layer k
+        here = cover * eased((near / _HIDING_SHARE).clamp(max=1.0))
+        # share not hidden by the surface's part in front of layer k: 1 - h (1 - b) as a sum of positive terms
+        passes = (1.0 - here) + here * behind
         # share of the arriving light stopped in layer k
         stops = cover * (behind - beyond) / passes.clamp_min(_LEAST_PASSING)
         stopped.append(arriving * stops)
