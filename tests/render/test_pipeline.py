@@ -123,3 +123,12 @@ def test_a_surface_just_in_front_of_another_one_hides_it() -> None:
     scene = plane_scene(CLOSE, CAMERA.replace(focus_m=1.2), (110, 150), samples=64)
     dof = DepthOfField(scene.camera, tolerance=0)
     assert psnr(scene, dof.layers(layers(), torch.tensor([3.2, 2.9, 1.2]))[:, :3]) > 55.0  # 48.7
+
+
+def test_a_known_background_does_not_shine_through_pixels_of_two_other_surfaces(engine: str) -> None:
+    """Matting splits such pixels; together both surfaces cover all of them."""
+    coc = torch.where(torch.rand(1, 1, 64, 96, generator=torch.Generator().manual_seed(0)) < 0.1, -12.0, -8.0)
+    light = torch.full_like(coc, 0.02)
+    known = {"background": torch.ones_like(light), "background_coc_px": torch.full_like(coc, 40.0)}
+    picture = blur_by_coc(light, coc, depth_edges="as given", **known)
+    assert float(picture[..., 8:-8, 8:-8].max()) < 0.021  # 0.20

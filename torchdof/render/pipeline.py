@@ -353,11 +353,13 @@ def _before_background(
     valid = None if options.check else torch.isfinite(behind_coc) & torch.isfinite(behind).all(1, keepdim=True)
     behind_coc = behind_coc.clamp(*ends)
     own_light, other_light, other_coc, other_weight = matte(light, coc, weight, covered=covered)
-    # of the second surfaces of mixed pixels keep the nearer ones; the known background replaces the farther ones
-    own_weight, other_weight = 1.0 - other_weight, torch.where(other_coc < coc, other_weight, 0.0)
+    # a mixed pixel's nearer second surface stays; the background replaces a farther one that shows it
+    # 0: the background is the surface in the image, or the farther one of both
+    apart, of_farther = ((behind_coc - c - _SAME_PX).clamp(0.0, 1.0) for c in (coc, torch.maximum(coc, other_coc)))
+    own_weight = 1.0 - other_weight * (1.0 - of_farther)
+    other_weight = torch.where(other_coc < coc, other_weight, 0.0)
     if weight is not None:
         own_weight, other_weight = own_weight * weight, other_weight * weight
-    apart = (behind_coc - coc - _SAME_PX).clamp(0.0, 1.0)  # 0: the background is the surface in the image
     behind_weight = apart + (1.0 - apart) * other_weight
     if valid is not None:
         behind, behind_coc, behind_weight = (torch.where(valid, t, 0.0) for t in (behind, behind_coc, behind_weight))

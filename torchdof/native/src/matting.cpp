@@ -691,18 +691,20 @@ void Job::add_background() {
       const bool mixed = surfaces.row(1, y, x, other.data(), other_coc, weight);
       bool known = std::isfinite(scene.coc[1][at]);
       for (int c = 0; c < channels; c++) known &= std::isfinite(scene.light[1][c * area + at]);
-      const float here = surfaces.coc[at], there = std::clamp(scene.coc[1][at], low, high),
-                  apart = clamp01(there - here - SAME_PX);
-      // a given background replaces the farther surface of a mixed pixel
-      const float share = mixed && *other_coc < here ? *weight : 0.0f;
+      const float here = surfaces.coc[at], there = std::clamp(scene.coc[1][at], low, high);
+      // 0: the background is the surface in the image, or the farther one of both
+      const float apart = clamp01(there - here - SAME_PX), of_other = mixed ? *weight : 0.0f,
+                  of_farther = mixed ? clamp01(there - std::max(here, *other_coc) - SAME_PX) : apart;
+      // a mixed pixel's nearer second surface stays; the background replaces a farther one that shows it
+      const float share = mixed && *other_coc < here ? of_other : 0.0f;
       for (int c = 0; c < channels; c++) {
         planes[0][c * area + at] = mixed ? *other[c] : 0.0f;
         planes[1][c * area + at] = *own[c];
         planes[2][c * area + at] = known ? scene.light[1][c * area + at] : 0.0f;
       }
       const float coc[3] = {mixed ? *other_coc : here, here, std::max(known ? there : 0.0f, here)};
-      // apart = 0: the background is the surface in the image
-      const float weights[3] = {share, own_weight ? *own_weight : 1.0f, known ? apart + (1.0f - apart) * share : 0.0f};
+      const float weights[3] = {share, (own_weight ? *own_weight : 1.0f) + of_other * of_farther,
+                                known ? apart + (1.0f - apart) * share : 0.0f};
       for (int i = 0; i < 3; i++) {
         planes[i][channels * area + at] = coc[i];
         planes[i][(channels + 1) * area + at] = weights[i];
