@@ -194,7 +194,7 @@ def cost_of_rays(variant: Any, kernel: str, r: Any, items: int) -> tuple[float, 
 
 
 def cost_of_layers(variant: Any, kernel: str, r: Any, depth: int) -> tuple[float, float]:
-    """Bytes that a launch of a kernel moves if each value is read once, and its floating-point operations."""
+    """Bytes that a launch of a kernel moves if a pass reads each value once, and its floating-point operations."""
     channels, surfaces = variant[:2]
     values, tile, maps = channels + 2, 16 * 32, surfaces * (channels + 2)
     items, frame = depth // max(r.layers, 1) if kernel == "convolve_back" else depth, r.scale * r.scale
@@ -218,7 +218,7 @@ def cost_of_layers(variant: Any, kernel: str, r: Any, depth: int) -> tuple[float
         "composite": (lit * values + 2.0 * picture, 2.0 * taps * values),
         "walk_back": (lit * (2 * values + 1) + 2.0 * picture, 0.0),
         "convolve_back": ((lit + read) * values, 2.0 * taps * values),
-        "terms_back": (read * values + 3.0 * maps * pixels, 0.0),
+        "terms_back": (read * (2 * values - 2) + 3.0 * maps * pixels, 0.0),
         "stand_ins": (2.0 * picture + maps * r.height * r.width * depth, 0.0),
         "stand_ins_back": (3.0 * picture + 3.0 * maps * r.height * r.width * depth, 0.0),
         "upsample": (2.0 * picture + canvas * depth, 0.0),

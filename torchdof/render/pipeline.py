@@ -353,9 +353,9 @@ def _before_background(
     valid = None if options.check else torch.isfinite(behind_coc) & torch.isfinite(behind).all(1, keepdim=True)
     behind_coc = behind_coc.clamp(*ends)
     own_light, other_light, other_coc, other_weight = matte(light, coc, weight, covered=covered)
-    # a mixed pixel's nearer second surface stays; the background replaces a farther one that shows it
-    # 0: the background is the surface in the image, or the farther one of both
+    # 0 where the background is the surface in the image, or the farther one of a mixed pixel
     apart, of_farther = ((behind_coc - c - _SAME_PX).clamp(0.0, 1.0) for c in (coc, torch.maximum(coc, other_coc)))
+    # of two surfaces the nearer one stays; the background replaces the farther one if that shows it
     own_weight = 1.0 - other_weight * (1.0 - of_farther)
     other_weight = torch.where(other_coc < coc, other_weight, 0.0)
     if weight is not None:

@@ -692,10 +692,10 @@ void Job::add_background() {
       bool known = std::isfinite(scene.coc[1][at]);
       for (int c = 0; c < channels; c++) known &= std::isfinite(scene.light[1][c * area + at]);
       const float here = surfaces.coc[at], there = std::clamp(scene.coc[1][at], low, high);
-      // 0: the background is the surface in the image, or the farther one of both
+      // 0 where the background is the surface in the image, or the farther one of a mixed pixel
       const float apart = clamp01(there - here - SAME_PX), of_other = mixed ? *weight : 0.0f,
                   of_farther = mixed ? clamp01(there - std::max(here, *other_coc) - SAME_PX) : apart;
-      // a mixed pixel's nearer second surface stays; the background replaces a farther one that shows it
+      // of two surfaces the nearer one stays; the background replaces the farther one if that shows it
       const float share = mixed && *other_coc < here ? of_other : 0.0f;
       for (int c = 0; c < channels; c++) {
         planes[0][c * area + at] = mixed ? *other[c] : 0.0f;
