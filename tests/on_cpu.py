@@ -13,9 +13,11 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+
+import torch
 
 from torchdof.kernels import edges, layers, loader, matting
 
@@ -71,6 +73,7 @@ extern "C" int cuGetErrorString(int status, const char **text) {
 }
 """
 STREAM = 7  # the only one of this driver
+OTHER_PICTURE = "on this device they render another picture than PyTorch"  # of the warning after a trial
 _OPTIONS = ("-std=c++17", "-march=native", "-shared", "-fPIC", "-Wno-unknown-pragmas")
 
 
@@ -122,6 +125,17 @@ def edges_module(channels: int, device: int = 0) -> loader.Launch:
 def rays_module(device: int = 0) -> loader.Launch:
     """As :func:`torchdof.kernels.rays.module`, with that driver."""
     return _module("rays.cu", "-O3")
+
+
+@contextlib.contextmanager
+def new_memory_of_nan() -> Iterator[None]:
+    """A block in which new memory is NaN, so that what a kernel does not write is never right by chance."""
+    torch.use_deterministic_algorithms(True)
+    try:
+        assert torch.empty(1).isnan()
+        yield
+    finally:
+        torch.use_deterministic_algorithms(False)
 
 
 def without(wrong: str, module: Callable[..., loader.Launch]) -> Callable[..., loader.Launch]:

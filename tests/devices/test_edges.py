@@ -122,15 +122,11 @@ def test_edges_of_hostile_maps_are_the_plain_engines(
 
 
 def test_a_batch_is_repaired_as_its_items_are_alone_with_the_same_bits_each_time(launched: list[str]) -> None:
-    """Whatever new memory contains: for deterministic algorithms PyTorch fills it with NaN."""
+    """Whatever new memory contains."""
     given = scene(2, batch=3)
     together = repaired(given)
-    torch.use_deterministic_algorithms(True)
-    try:
-        assert torch.empty(1).isnan()
+    with on_cpu.new_memory_of_nan():
         again = repaired(given)
-    finally:
-        torch.use_deterministic_algorithms(False)
     assert all(map(torch.equal, together, again))
     for item in range(3):
         alone = repaired(Scene(*(values[item : item + 1] for values in given)))
@@ -157,12 +153,8 @@ def test_kernels_that_find_other_edges_are_not_used(
     monkeypatch.setattr(kernels, "module", on_cpu.without(wrong, kernels.module))
     monkeypatch.setenv("TORCHDOF_ENGINE", "auto")
     given = scene(2)
-    torch.use_deterministic_algorithms(True)  # new memory is NaN instead of what the last frame left
-    try:
-        with pytest.warns(RuntimeWarning, match="on this device they render another picture than PyTorch"):
-            blur_by_coc(*given)
-    finally:
-        torch.use_deterministic_algorithms(False)
+    with pytest.warns(RuntimeWarning, match=on_cpu.OTHER_PICTURE), on_cpu.new_memory_of_nan():
+        blur_by_coc(*given)
     launched.clear()
     blur_by_coc(*given)
     assert launched and not KERNELS & {*launched}

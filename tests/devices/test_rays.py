@@ -57,7 +57,7 @@ def test_pictures_have_the_plain_engines_rays(
     monkeypatch.setenv("TORCHDOF_ENGINE", "auto" if wrong else "gpu")
     if wrong:
         monkeypatch.setattr(rays, "module", on_cpu.without(wrong, rays.module))
-        with pytest.warns(RuntimeWarning, match="on this device they render another picture than PyTorch"):
+        with pytest.warns(RuntimeWarning, match=on_cpu.OTHER_PICTURE), on_cpu.new_memory_of_nan():
             found = blur_by_coc(light, coc_px)
     else:
         found = blur_by_coc(light, coc_px)

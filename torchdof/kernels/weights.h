@@ -24,14 +24,13 @@ struct Stack {
     return left;
   }
 };
-// The share of a surface at or behind a layer, nearby; and how far it hides the light from behind.
-__device__ inline float unlimited_nearby(const Ramps &l, float place) { return l.at_or_behind(end_of_surface(place)); }
-__device__ inline float hides(float nearby) { return ramp(clamp01(nearby) / HIDING_SHARE, true); }
+// The share of a surface at or behind a layer nearby, over HIDING_SHARE, without limits.
+__device__ inline float nearby(const Ramps &l, float place) { return l.at_or_behind(end_of_surface(place)) / HIDING_SHARE; }
 __device__ inline Stack stack_of(const Ramps &l, const Pixel &p) {
   Stack t;
   for (int j = 0; j < SURFACES; j++) {
     const float at_or_behind = ramp(l.at_or_behind(p.place[j]), true), share = at_or_behind - ramp(l.behind(p.place[j]), true);
-    t.h[j] = p.weight[j] * hides(unlimited_nearby(l, p.place[j]));
+    t.h[j] = p.weight[j] * ramp(nearby(l, p.place[j]), true);
     t.passes[j] = 1 - t.h[j] + t.h[j] * at_or_behind;
     t.s[j] = p.weight[j] * share / torchdof::max(t.passes[j], LEAST_PASSING);
   }
@@ -61,12 +60,11 @@ __device__ inline void weigh_back(const Ramps &l, const Pixel &p, const Weights 
     of_arriving = of_stopped * t.s[j] + (1 - t.s[j]) * of_arriving;
     const float at_or_behind = ramp(l.at_or_behind(p.place[j]), true), share = at_or_behind - ramp(l.behind(p.place[j]), true);
     const float of_passes = of_visible * t.visible(j) - (t.passes[j] >= LEAST_PASSING ? of_s * t.s[j] / passing : 0.0f);
-    const float of_h = of_passes * (at_or_behind - 1) + of_known * left_by(t.h, SURFACES, j), near = unlimited_nearby(l, p.place[j]);
-    const float of_near = within(near) ? of_h * p.weight[j] * slope_of_ramp(near / HIDING_SHARE, true) / HIDING_SHARE : 0.0f;
+    const float of_h = of_passes * (at_or_behind - 1) + of_known * left_by(t.h, SURFACES, j), near = nearby(l, p.place[j]);
     of_place[j] += (of_difference + of_passes * t.h[j]) * slope_of_ramp(l.at_or_behind(p.place[j]), true) / l.width;
-    of_place[j] += of_near * slope_of_end(p.place[j]) / l.width;
+    of_place[j] += of_h * p.weight[j] * slope_of_ramp(near, true) * slope_of_end(p.place[j]) / (HIDING_SHARE * l.width);
     of_place[j] -= of_difference * slope_of_ramp(l.behind(p.place[j]), true) / l.next_width;
-    of_weight[j] += of_s * share / passing + of_h * hides(near);
+    of_weight[j] += of_s * share / passing + of_h * ramp(near, true);
   }
 }
 #else

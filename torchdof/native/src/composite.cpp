@@ -612,8 +612,8 @@ class Composite {
       vec left = broadcast(1.0f), unknown = left, normalizer = left, share = {};
       for (int j = 0; j < s_.count; j++) {
         const vec p = load<vec>(place[j] + i), cover = load<vec>(weight[j] + i), h = at_or_behind(l, p, over_);
-        const vec near = at_or_behind(l, end_of_surface(p), false);
-        const vec here = cover * eased(min(near / HIDING_SHARE, broadcast(1.0f))), there = 1.0f - here + here * h;
+        const vec near = unlimited_at_or_behind(l, end_of_surface(p)) / HIDING_SHARE;
+        const vec here = cover * ramp(near, true), there = 1.0f - here + here * h;
         const vec stops = cover * (h - behind(l, p, over_)) / max(there, broadcast(LEAST_PASSING));
         m[j] = left * stops;
         left *= 1.0f - stops;

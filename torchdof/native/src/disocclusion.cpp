@@ -289,18 +289,16 @@ class Filling {
       }
       const vec each = 1.0f / max(total, broadcast(LEAST_TOTAL));
       for (int i = 0; i < n; i++) store(out + (i + 1) * stride_ - F8, f8{});  // padding
-      for (int k = 0; k <= C; k++) {
-        read(k);
+      const auto mean_of = [&](int plane) {
+        read(plane);
         vec sum = {};
         for (int j = 0; j < count; j++) sum += child[j] * counts[j];
-        sum *= each;
-        if (k < C) {
-          put(k, sum);
-          continue;
-        }
-        put(C, absolute(sum));
-        put(means_, total > vec{} ? sum : broadcast(-NEVER_PX));
-      }
+        return sum * each;
+      };
+      for (int c = 0; c < C; c++) put(c, mean_of(c));
+      const vec coc = mean_of(C);
+      put(C, absolute(coc));
+      put(means_, total > vec{} ? coc : broadcast(-NEVER_PX));
       put(means_ + 1, total);
     }
   }

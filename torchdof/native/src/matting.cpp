@@ -692,18 +692,19 @@ void Job::add_background() {
       bool known = std::isfinite(scene.coc[1][at]);
       for (int c = 0; c < channels; c++) known &= std::isfinite(scene.light[1][c * area + at]);
       const float here = surfaces.coc[at], there = std::clamp(scene.coc[1][at], low, high);
+      const float second = mixed ? *other_coc : here, of_second = mixed ? *weight : 0.0f;
       // 0 where the background is the surface in the image, or the farther one of a mixed pixel
-      const float apart = clamp01(there - here - SAME_PX), of_other = mixed ? *weight : 0.0f,
-                  of_farther = mixed ? clamp01(there - std::max(here, *other_coc) - SAME_PX) : apart;
+      const float apart = clamp01(there - here - SAME_PX),
+                  of_farther = clamp01(there - std::max(here, second) - SAME_PX);
       // of two surfaces the nearer one stays; the background replaces the farther one if that shows it
-      const float share = mixed && *other_coc < here ? of_other : 0.0f;
+      const float share = second < here ? of_second : 0.0f;
       for (int c = 0; c < channels; c++) {
         planes[0][c * area + at] = mixed ? *other[c] : 0.0f;
         planes[1][c * area + at] = *own[c];
         planes[2][c * area + at] = known ? scene.light[1][c * area + at] : 0.0f;
       }
-      const float coc[3] = {mixed ? *other_coc : here, here, std::max(known ? there : 0.0f, here)};
-      const float weights[3] = {share, (own_weight ? *own_weight : 1.0f) + of_other * of_farther,
+      const float coc[3] = {second, here, std::max(known ? there : 0.0f, here)};
+      const float weights[3] = {share, (own_weight ? *own_weight : 1.0f) + of_second * of_farther,
                                 known ? apart + (1.0f - apart) * share : 0.0f};
       for (int i = 0; i < 3; i++) {
         planes[i][channels * area + at] = coc[i];

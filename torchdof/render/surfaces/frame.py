@@ -159,16 +159,17 @@ class PaddedFrame:
         Returns light ``m_k I``, ``[B, n, C, h, w]``, its weight ``m_k`` and the weight behind it ``M_k - m_k``,
         ``[B, n, 1, h, w]``.
         """
-        ramps, pairs, nearby = self.ramps[..., first : first + count + 1], [], []
+        ramps, pairs = self.ramps[..., first : first + count + 1], []
         for surface in self.surfaces:  # one after the other: on a CPU their maps then stay in its caches
-            x = self.cut(surface.x, halo)
-            weights = weights_at_or_behind(x, ramps)
+            weights = weights_at_or_behind(self.cut(surface.x, halo), ramps)
             weights = (eased(weights) if self.occlusion else weights).unsqueeze(2)
             pairs.append((weights[:, :-1], weights[:, 1:]))
-            if self.stacked:
-                nearby.append(weights_at_or_behind(end_of_surface(x), ramps[..., :-1]).unsqueeze(2))
         surfaces = [PaddedSurface(*(self.cut(t.unsqueeze(1), halo) for t in s if t is not None)) for s in self.surfaces]
-        return _stacked(surfaces, pairs, nearby) if self.stacked else _mixed(surfaces, pairs)
+        if not self.stacked:
+            return _mixed(surfaces, pairs)
+        ends = [end_of_surface(self.cut(surface.x, halo)) for surface in self.surfaces]
+        nearby = [weights_at_or_behind(end, ramps[..., :-1]).unsqueeze(2) for end in ends]
+        return _stacked(surfaces, pairs, nearby)
 
     def stand_ins(self) -> tuple[Tensor, Tensor]:
         """Stand-ins for the picture at and behind the focus: light ``[B, C, h, w]`` and cover ``[B, 1, h, w]``.
