@@ -50,6 +50,14 @@ def test_the_background_behind_two_blurred_surfaces_is_the_farthest_one_around()
     assert torch.allclose(behind[0, :, 24, 16], BLUE, atol=0.02)  # the wall, not the surface in between
 
 
+def test_what_lies_behind_the_next_surface_is_not_the_background_of_a_foreground_beside_it() -> None:
+    """The coarsest level reads some of the wall, 40 px from the foreground, but hardly trusts it."""
+    coc = torch.full((1, 1, 96, 160), -17.0)
+    coc[..., 64:104], coc[..., 104:] = -11.0, 9.0
+    *_, behind = surfaces(torch.where(coc > 0, 1.0, 0.1).expand(1, 3, -1, -1), coc, levels=6)
+    assert float(behind[0, :, 48, :60].max()) < 0.12
+
+
 def test_gaps_in_a_sloping_foreground_show_no_specks(engine: str) -> None:
     """Nothing is in focus, so the picture is smooth; with means of a slope and a wall as hidden samples it is not."""
     height, width = 160, 240

@@ -109,7 +109,7 @@ float mix(const Level *levels, const Sample *samples, int n, bool farthest, floa
     if (farthest) {
       const float apart = ((const float *)samples[l].values.data())[of_coc] - out[of_coc];
       if (total > 0) vote *= 1.0f - is_another_surface(-apart);
-      total *= 1.0f - std::min(level_weight * weight / CERTAIN, 1.0f) * is_another_surface(apart);
+      total *= 1.0f - std::min(level_weight * weight / SURE, 1.0f) * is_another_surface(apart);
     }
     total += vote;
     if (!(vote > 0)) continue;

@@ -6,7 +6,7 @@
 namespace torchdof {
 
 using constants::disocclusion::BEHIND_STEP, constants::disocclusion::CERTAIN, constants::disocclusion::FINE_LEVELS;
-using constants::disocclusion::LEAST_SEEN, constants::disocclusion::LEAST_TOTAL;
+using constants::disocclusion::LEAST_SEEN, constants::disocclusion::LEAST_TOTAL, constants::disocclusion::SURE;
 using constants::native::MOST_LEVELS;
 
 }  // namespace torchdof

@@ -109,7 +109,7 @@ struct Behind {
     float weight, looked;                   // sum of the parts, or 0 if tiny; clamped blur
     float mean[MOST_VALUES];                // light and coc
     float vote;
-    float d_mean[MOST_VALUES], d_vote, d_sure;  // gradients; d_sure: that of looked * weight / CERTAIN up to 1
+    float d_mean[MOST_VALUES], d_vote, d_sure;  // gradients; d_sure: that of looked * weight / SURE up to 1
   };
   struct Result {
     float values[MOST_VALUES], votes;  // values: light and coc
@@ -191,7 +191,7 @@ struct Behind {
     float apart, nearer, sure, vote, left, votes, part;  // left: share of the votes before that stays
     Change(const Found &f, const Result &r, int coc_plane) : apart(f.mean[coc_plane] - r.values[coc_plane]) {
       nearer = r.votes > 0 ? is_another_surface(-apart) : 0.0f;
-      sure = std::min(f.looked * f.weight / CERTAIN, 1.0f);
+      sure = std::min(f.looked * f.weight / SURE, 1.0f);
       vote = f.vote * (1.0f - nearer);
       left = 1.0f - sure * is_another_surface(apart);
       votes = r.votes * left + vote;
@@ -291,7 +291,7 @@ struct Behind {
       const size_t size = (size_t)level.rows * level.columns;
       const float counted = f.weight * level.slope, bounded = std::min(counted, level.most);
       const float blur = unlimited_read(std::fabs(least), level.least_px),
-                  d_sure = f.looked * f.weight <= CERTAIN ? f.d_sure / CERTAIN : 0.0f;
+                  d_sure = f.looked * f.weight <= SURE ? f.d_sure / SURE : 0.0f;
       if (blur <= 1) d_least += (f.d_vote * bounded + d_sure * f.weight) / level.least_px * (least < 0 ? -1.0f : 1.0f);
       float d_parts = 0;
       if (f.weight > 0) {

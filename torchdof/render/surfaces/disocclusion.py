@@ -31,13 +31,13 @@ _BEHIND_PX = 1.0
 # Levels of the pyramid
 _FALL = 0.35  # weight of a level relative to the next finer one; larger: hidden areas are smoother
 _FINE_LEVELS = 2  # levels that each pixel reads; coarser ones are read once per cell of 2**_FINE_LEVELS pixels
-_SURE = 0.1  # weight of the samples of a level at which its vote is full
+_SURE = 0.1  # weight of the samples of a level at which its vote is full, or replaces that of nearer surfaces
 _LEAST_SEEN = 1e-4  # weight of samples up to which they count as empty
 _LEAST_TOTAL = 1e-9  # smallest divisor of sums of light
 _MIXED = 0.05  # share above which the second surface of a pixel counts; larger: fewer mixed pixels
 _HIDING_FROM_PX = 0.5  # px: pixels blurred less hide nothing that is seen
 _OF_MEAN = 4.0  # mean blur, over the mean coc, from which a hidden sample fades; larger: more sharp specks
-_CERTAIN = 0.01  # votes at which a hidden sample has full weight, or a farther surface replaces a nearer one
+_CERTAIN = 0.01  # votes at which a hidden sample has full weight
 
 BEHIND_STEP = 2**_FINE_LEVELS
 """Distance in pixels of the samples of the light behind both surfaces, counted from the image's centre."""
@@ -512,7 +512,7 @@ def search(levels: Sequence[Level], shown: Tensor, weight: Tensor, coc_px: Tenso
     if not farthest:
         total = votes.sum(0)
         return (shown * votes).sum(0) / total.clamp_min(_LEAST_TOTAL), total
-    sure = (looked * weight / _CERTAIN).clamp(max=1.0)
+    sure = (looked * weight / _SURE).clamp(max=1.0)
     total, seen = votes[0], shown[0]
     for k in range(1, len(levels)):
         beyond = shown[k] - seen
