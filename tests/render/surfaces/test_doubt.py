@@ -108,12 +108,29 @@ def test_full_doubt_blurs_beside_a_foreground_by_a_share_of_its_blur_that_fades(
     assert_close(blurred[28:], given[0, 0, 4, 28:])
 
 
+def test_the_share_that_fades_is_that_of_the_foreground_also_where_what_it_hides_is_blurred(engine: str) -> None:
+    """The blurred foreground in 20 columns; beyond them the map slopes from -1 to 1 px, along the edge."""
+    repaired = torch.linspace(-1.0, 1.0, 60)[:, None].expand(1, 1, 60, 40).clone()
+    repaired[..., :20] = -10.0
+    given = repaired.clone()
+    given[..., 19] = -1.0  # the repair has moved the edge by a pixel
+    blurred = blurred_in_doubt(given, repaired, torch.ones(1, 1, 1, 1))[0, 0]
+    expected = torch.tensor([2 * k / 17 * 8.0 for k in range(8, 2, -1)]).expand(60, -1)
+    assert_close(blurred[:, 20:26], expected)
+    assert blurred[:, 28:].equal(repaired[0, 0, :, 28:])
+
+
 def test_a_small_change_of_a_map_in_doubt_has_a_small_effect(engine: str) -> None:
+    """On its blur; and on its side of the focus where it is in focus."""
     dice = torch.Generator().manual_seed(0)
     given = -12.0 * torch.rand(1, 1, 192, 288, generator=dice) - 0.1
-    given = torch.where(torch.arange(288) % 48 < 24, given, 0.1 * given)  # columns of blurred and of sharp pixels
+    is_sharp = torch.arange(288) % 48 >= 24  # columns of blurred and of sharp pixels
+    given = torch.where(is_sharp, 0.1 * given + 0.6, given)
     moved = given - 2.0 * (torch.rand(given.shape, generator=dice) - 0.97).clamp_min(0.0) / 0.03
     nearby = moved + 1e-3 * (torch.rand(moved.shape, generator=dice) - 0.5)
     blurred, again = (blurred_in_doubt(given, repaired, torch.ones(1, 1, 1, 1)) for repaired in (moved, nearby))
     assert float((blurred != moved).float().mean()) > 0.2
-    assert float((again - blurred).abs().max()) < 0.02
+    assert float((again.abs() - blurred.abs()).abs().max()) < 0.02
+    is_raised = is_sharp & (blurred.abs() > 1.0 + moved.abs())
+    assert float(is_raised.float().mean()) > 0.05
+    assert float((again - blurred)[is_raised].abs().max()) < 0.02

@@ -39,7 +39,7 @@ class Blur : Frame {
 
  private:
   void blur(const Part &part) const {
-    const Part beside = part.grown(REACH), whole = beside.grown(REACH);
+    const Part beside = part.grown(REACH), farther = beside.grown(REACH), whole = farther.grown(REACH);
     const Grid nearness(whole), moved(whole), rows(whole);
     const auto near_of = [](float coc) { return std::fabs(coc) <= LARGEST ? -coc : -NEVER; };
     fetch(given_, moved, near_of);
@@ -52,10 +52,11 @@ class Blur : Frame {
     });
     if (!(reduce_max(any) > 0)) return;
 
-    const Grid near(beside), is_near(beside), share(part), is_beside(part);
-    max_filter<REACH>(nearness, near, rows, beside);
+    const Grid near(farther), compared(beside), is_near(beside), share(part), is_beside(part);
+    max_filter<REACH>(nearness, near, rows, farther);
+    max_filter<REACH>(near, compared, rows, beside);
     each_vector(beside, [&](int y, int x) {
-      const vec nearest = max(load<vec>(near.at(y, x)), broadcast(1.0f));
+      const vec nearest = max(load<vec>(compared.at(y, x)), broadcast(1.0f));
       store(is_near.at(y, x), clamp01(NEAR_SLOPE * (load<vec>(nearness.at(y, x)) / nearest - NEAR_FROM)));
     });
     clamp_to_frame(is_near, beside);
@@ -81,7 +82,7 @@ class Blur : Frame {
         const float is_step = clamp01(*high.at(y, x) + *low.at(y, x) - LEAST_STEP_PX + 0.5f);
         const float beside = is_beyond * OF_NEAR * nearest * std::min(2.0f * *share.at(y, x), 1.0f);
         const float least = doubt_ * std::max(beside, is_step * LEAST_BLUR_PX * *fading.at(y, x));
-        if (std::fabs(own) < least) out_[pixel(y, x)] = own > 0 ? -least : least;
+        if (std::fabs(own) < least) out_[pixel(y, x)] = least;
       }
   }
 

@@ -63,8 +63,7 @@ def surfaces_of_image(
        surfaces. It shows where the hidden surface is blurred itself and nothing else reaches a pixel.
     5. For each pixel, average the levels that have samples behind it, with larger weights for finer ones. Use only the
        samples behind it, as the foreground's colour must not leak in. The search reaches no farther than the pixel's
-       blur: deeper inside, hidden surfaces never show. A slightly farther sample counts as part of the same surface if
-       that is strongly blurred: the mean coc of a slope and of a surface beyond the focus could be 0, a sharp speck.
+       blur: deeper inside, hidden surfaces never show.
     6. Replace second surfaces that are hardly mixed in by the hidden sample.
 
     Args:

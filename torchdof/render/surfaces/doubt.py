@@ -62,6 +62,9 @@ def blurred_in_doubt(given: Tensor, repaired: Tensor, doubt: Tensor, ops: Ops = 
        near surface among the pixels up to ``_REACH`` away, from a half to 0.
     2. At any edge, it is at least ``_LEAST_BLUR_PX doubt``, which fades within a few pixels.
 
+    Pixels with a raised blur lie behind the focus, where they hide nothing. In front of it they would be a surface of
+    their own, with an outline, which surfaces in focus and the foreground do not have.
+
     Args:
         given: Coc in pixels before the repair, ``[B or 1, 1, H, W]``. Invalid values stay.
         repaired: The same after it.
@@ -69,7 +72,7 @@ def blurred_in_doubt(given: Tensor, repaired: Tensor, doubt: Tensor, ops: Ops = 
         ops: Skips maps that are not in doubt.
 
     Returns:
-        ``[B, 1, H, W]``; pixels keep their side of the focus.
+        ``[B, 1, H, W]``.
     """
     if not active().in_doubt or (not is_traced() and not (doubt > 0).any()):
         return repaired
@@ -88,7 +91,8 @@ def _blurred(given: Tensor, repaired: Tensor, doubt: Tensor) -> Tensor:
     moved = torch.where(valid, (repaired - given).abs() / _MOVED_PX - 0.5, 0.0).clamp(0.0, 1.0)
     nearness = torch.where(valid, -repaired, -NEVER)
     near = highest(nearness, _REACH)
-    is_near = (_NEAR_SLOPE * (nearness / near.clamp_min(1.0) - _NEAR_FROM)).clamp(0.0, 1.0)
+    # compared with surfaces twice as far away: each pixel in reach of one compares its surroundings with the same one
+    is_near = (_NEAR_SLOPE * (nearness / highest(near, _REACH).clamp_min(1.0) - _NEAR_FROM)).clamp(0.0, 1.0)
     is_beyond = (near - hiding_px(nearness.abs()) + 0.5).clamp(0.0, 1.0) * highest(moved, _REACH)
     beside = is_beyond * _OF_NEAR * near * (2.0 * mean_around(is_near, _REACH)).clamp(max=1.0)
 
@@ -96,5 +100,4 @@ def _blurred(given: Tensor, repaired: Tensor, doubt: Tensor) -> Tensor:
     is_step = (step - _LEAST_STEP_PX + 0.5).clamp(0.0, 1.0)
     at_edge = is_step * _LEAST_BLUR_PX * mean_around(highest(moved, 1), _AT_EDGE_PX)
     least = doubt * torch.maximum(beside, at_edge)
-    is_sharper = valid & (nearness.abs() < least)
-    return torch.where(is_sharper, torch.where(nearness > 0, -least, least), repaired)
+    return torch.where(valid & (nearness.abs() < least), least, repaired)
