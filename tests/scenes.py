@@ -59,6 +59,16 @@ def slope(first: float, last: float, height: int = HEIGHT, width: int = WIDTH) -
     return torch.linspace(first, last, width).expand(1, 1, height, width).clone()
 
 
+def overshoots() -> tuple[Tensor, Tensor]:
+    """A dark foreground before walls beyond the focus; some pixels at its edge are too near. Light and coc."""
+    dice = torch.Generator().manual_seed(3)
+    coc = torch.full((1, 1, 80, 96), -8.0)
+    coc[..., 38:46] = torch.where(torch.rand(1, 1, 80, 8, generator=dice) < 0.35, -11.3, -8.0)
+    walls = torch.rand(1, 1, 8, 6, generator=dice).repeat_interleave(10, 2).repeat_interleave(8, 3)
+    coc[..., 48:] = torch.where(walls > 0.5, 47.0, 30.5)
+    return torch.where(coc > 0, 0.2, 0.005), coc
+
+
 def halves(left: float, right: float) -> Tensor:
     """A map of two planes, left and right."""
     values = whole(left)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.scenes import furry_post, wavy_post
+from tests.scenes import furry_post, overshoots, wavy_post
 from torchdof import blur_by_coc, native
 from torchdof.options import DepthEdges
 from torchdof.reference.degraded import degrade
@@ -33,10 +33,12 @@ def scene_for(rule: str) -> tuple[Tensor, Tensor]:
         return furry_post()[:2]
     if rule == "in_doubt":
         return wavy_post()[:2]
-    if rule in ("one_side", "fewer_rays"):
+    if rule == "one_side":
+        return overshoots()
+    if rule in ("own_slope", "fewer_rays"):
         light = torch.rand(1, 3, 64, 96, generator=torch.Generator().manual_seed(0))
         y, x = torch.meshgrid(torch.linspace(0, 1, 64), torch.linspace(0, 1, 96), indexing="ij")
-        if rule == "one_side":  # two steep slopes, one on each side of the focus
+        if rule == "own_slope":  # two steep slopes, one on each side of the focus
             return light, torch.where(x < 0.5, 8 * y - 24, 10 * y + 12)[None, None]
         light[..., ::5, ::5] *= 200  # many lamps in front of noise
         noise = torch.rand(1, 1, 64, 96, generator=torch.Generator().manual_seed(1))

@@ -32,6 +32,7 @@ class Rules:
     own_emitters: bool = _rule("the same where the emitter lies on the pixel's own surface")
     filling: bool = _rule("fills hidden surfaces behind blurred foregrounds")
     light_behind: bool = _rule("puts light behind the hidden surface")
+    own_slope: bool = _rule("takes a slightly farther sample for the same, sloping surface")
     one_side: bool = _rule("fades hidden samples that mix both sides of the focus")
     continuation: bool = _rule("continues a mixed pixel's far surface behind the near one")
     stand_ins: bool = _rule("lets barely blurred surfaces be their own background")

@@ -77,14 +77,14 @@ struct Sample {
     level_weight = is_read(std::fabs(here), level.least_px);
     weight = 0;
     if (!(level_weight > 0)) return;
-    const float down = row.part, right = column.part;
+    const float end = end_of_slope(here), down = row.part, right = column.part;
     const float share[4] = {(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right};
     const float *corners[4];
     float total = 0, counts[4];
     for (int k = 0; k < 4; k++) {
       corners[k] =
           level.at(std::min(row.before + k / 2, level.height - 1), std::min(column.before + k % 2, level.width - 1));
-      total += counts[k] = share[k] * corners[k][of_coc + 1] * is_another_surface(corners[k][of_coc] - here);
+      total += counts[k] = share[k] * corners[k][of_coc + 1] * is_another_surface(corners[k][of_coc] - end);
     }
     if (!(total > LEAST_SEEN)) return;
     weight = total;
@@ -519,7 +519,7 @@ class Filling {
     constexpr int VECTORS = CELL / LANES, ROWS = CELL / 2 + 2;
     const int means = (CHANNELS ? CHANNELS : C_) + 1, planes = means + 2;
     const size_t beside = (size_t)planes * VECTORS, below = 2 * beside, of_level = ROWS * below;
-    const vec size = max(here, -here);
+    const vec size = max(here, -here), end = end_of_slope(here);
     vec total = {};
     for (int k = 0; k <= means; k++) mean[k] = vec{};
     for (int i = to.first; i < to.count; i++) {
@@ -535,7 +535,7 @@ class Filling {
       const vec left = 1.0f - right,
                 shares[4] = {left * (1.0f - row.part), right * (1.0f - row.part), left * row.part, right * row.part};
       for (int k = 0; k < 4; k++) {
-        const vec farther = is_another_surface(corners[k][means * VECTORS] - here);
+        const vec farther = is_another_surface(corners[k][means * VECTORS] - end);
         weight += counts[k] = shares[k] * corners[k][(means + 1) * VECTORS] * farther;
       }
       const vec level_weight = is_read(size, level.least_px);

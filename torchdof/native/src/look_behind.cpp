@@ -3,7 +3,8 @@
 //
 // For a pixel with coc c, and the four samples j of level l around it with coc d, weight w and bilinear weight s:
 //
-//   p_j = s w clamp(d - c - BEHIND_PX + 1/2, 0, 1)      part of a sample that lies behind it
+//   e = c + max(OWN_SLOPE |c| - BEHIND_PX, 0)           largest coc of the pixel's own surface
+//   p_j = s w clamp(d - e - BEHIND_PX + 1/2, 0, 1)      part of a sample that lies behind it
 //   m_l = sum p_j sample_j / sum p_j                    light and coc of the level
 //   v_l = clamp(|c| / least_l - 1, 0, 1) min(slope_l sum p_j, most_l)   its votes
 //
@@ -125,10 +126,11 @@ struct Behind {
     const float *const cocs = level.values + (planes() - 2) * size, *const weights = cocs + size;
     const int row = rows[l].before[y], column = columns[l].before[x];
     const float below = rows[l].part[y], aside = columns[l].part[x];
+    const float end = end_of_slope(coc);
     bool any = false;
     for (int j = 0; j < 4; j++) {
       f.at[j] = (size_t)(row + j / 2) * level.columns + column + j % 2;
-      f.is_behind[j] = unlimited_another_surface(cocs[f.at[j]] - coc);
+      f.is_behind[j] = unlimited_another_surface(cocs[f.at[j]] - end);
       any |= f.is_behind[j] >= 0;
     }
     if (!any) return false;
@@ -312,7 +314,7 @@ struct Behind {
         if (!within(f.is_behind[j])) continue;
         const float d_distance = d_part * f.share[j] * value[(planes() - 1) * size];
         d_value[(planes() - 2) * size] += d_distance;
-        d_least -= d_distance;
+        d_least -= d_distance * rate_of_end(least);
       }
     }
     // the gradient of equal coc is shared by columns, then by rows

@@ -15,7 +15,7 @@ namespace torchdof {
 
 // Constants of Python modules, which give their meanings, units and effects.
 using constants::composite::KNOWN;
-using constants::disocclusion::BEHIND_PX, constants::disocclusion::OF_MEAN;
+using constants::disocclusion::BEHIND_PX, constants::disocclusion::OF_MEAN, constants::disocclusion::OWN_SLOPE;
 using constants::doubt::APART_PX, constants::doubt::SHARPER;
 using constants::frame::AT_FOCUS, constants::frame::OFF_FOCUS, constants::frame::BARELY_BLURRED;
 using constants::frame::CONTINUES_FROM, constants::frame::COUNTED, constants::frame::HIDDEN_WEIGHT;
@@ -70,6 +70,16 @@ inline V on_far(V n) {
 template <typename V>
 inline V unlimited_sided(V sided) {
   return PLACE_SLOPE * (sided - SIDED_FROM);
+}
+
+// Largest coc of a pixel's own surface nearby, which may slope: c + max(OWN_SLOPE |c| - BEHIND_PX, 0); and its
+// derivative. render/surfaces/disocclusion.py, end_of_slope.
+template <typename V>
+inline V end_of_slope(V coc) {
+  return coc + max(absolute(coc) * OWN_SLOPE - BEHIND_PX, V{});
+}
+inline float rate_of_end(float coc) {
+  return OWN_SLOPE * absolute(coc) >= BEHIND_PX ? 1.0f + (coc < 0 ? -OWN_SLOPE : OWN_SLOPE) : 1.0f;
 }
 
 // Confidence that samples with the mean coc c and the mean blur b lie on one side of the focus: clamp(1 + OF_MEAN |c| -

@@ -27,6 +27,7 @@ from .matting import NEVER_PX, Matted
 
 _BEHIND_PX = 1.0
 """Difference in coc at which a sample lies on another surface with confidence 1/2; 1 at 1/2 px more."""
+_OWN_SLOPE = 0.25  # part of a pixel's blur by which its own surface may be farther nearby; larger: fewer hidden samples
 
 # Levels of the pyramid
 _FALL = 0.35  # weight of a level relative to the next finer one; larger: hidden areas are smoother
@@ -63,7 +64,8 @@ def surfaces_of_image(
        surfaces. It shows where the hidden surface is blurred itself and nothing else reaches a pixel.
     5. For each pixel, average the levels that have samples behind it, with larger weights for finer ones. Use only the
        samples behind it, as the foreground's colour must not leak in. The search reaches no farther than the pixel's
-       blur: deeper inside, hidden surfaces never show.
+       blur: deeper inside, hidden surfaces never show. A slightly farther sample counts as part of the same surface if
+       that is strongly blurred, as a slope is not its own background.
     6. Replace second surfaces that are hardly mixed in by the hidden sample.
 
     Args:
@@ -114,6 +116,12 @@ def _operator(
 def is_another_surface(distance_px: Tensor) -> Tensor:
     """Confidence, 0 to 1, that a surface farther by ``distance_px`` of coc is another surface."""
     return (distance_px - _BEHIND_PX + 0.5).clamp(0.0, 1.0)
+
+
+def end_of_slope(coc_px: Tensor) -> Tensor:
+    """Largest coc of a pixel's own surface nearby, which may slope, of the coc of the pixel."""
+    slope = _OWN_SLOPE if active().own_slope else 0.0
+    return coc_px + (slope * coc_px.abs() - _BEHIND_PX).clamp_min(0.0)
 
 
 def is_read(coc_px: Tensor, least_px: float | Tensor) -> Tensor:
@@ -481,7 +489,7 @@ def counted_behind(samples: Tensor, share: Tensor, coc_px: Tensor, channels: int
     """
     count = samples.shape[channels] - 2
     coc, weight = samples.narrow(channels, count, 1), samples.narrow(channels, count + 1, 1)
-    part = share * weight * is_another_surface(coc - coc_px)
+    part = share * weight * is_another_surface(coc - end_of_slope(coc_px))
     return samples.narrow(channels, 0, count + 1) * part, part
 
 
