@@ -37,6 +37,9 @@ RULES: dict[str, Callable[[Tensor], Tensor]] = {
     "continuation(v)[0]": frame.continuation_weight,
     "visible_part(v)[0]": frame.visible_part,
     "end_of_surface(v)[0]": frame.end_of_surface,
+    "is_clear(v, broadcast(-0.7f), broadcast(0.8f), broadcast(0.97f))[0]": lambda x: frame.is_clear(
+        x, torch.full_like(x, -0.7), torch.full_like(x, 0.8), torch.full_like(x, 0.97)
+    ),
     "at_focus(v)[0]": frame.at_focus,
     "stands_in(v)[0]": frame.stands_in,
     "counts(v)[0]": frame.counts,
@@ -129,6 +132,8 @@ def test_rules_at_points_computed_by_hand() -> None:
     assert frame.visible_part(torch.tensor([0.0, 0.03, 0.5])).tolist() == pytest.approx([1.0, 0.5, 0.0])
     cover = torch.tensor([0.003, 0.053, 0.6])
     assert frame.continuation_weight(cover).tolist() == pytest.approx([0.0, 0.4735, 0.4])
+    farther, cover, beyond = torch.tensor([[-1.0, -2.5, -1.0, -1.0], [1.0, 1.0, 0.5, 1.0], [1.0, 0.0, 0.0, 0.97]])
+    assert frame.is_clear(torch.tensor(-3.0), farther, cover, beyond).tolist() == pytest.approx([1.0, 0.5, 0.5, 0.5])
     assert frame.end_of_surface(torch.tensor([-8.0, -1.0, 0.0, 4.0])).tolist() == [-4.0, 0.0, 1.0, 6.0]
     assert frame.at_focus(torch.tensor([-1.0, -0.1, 0.0, 5.0])).tolist() == pytest.approx([0.0, 0.75, 1.0, 1.0])
     assert frame.stands_in(torch.tensor([-3.5, -2.25, -1.0, -0.0125, 1.0])).tolist() == pytest.approx(

@@ -129,6 +129,20 @@ def test_a_known_background_does_not_shine_through_pixels_of_two_other_surfaces(
     assert float(picture[..., 8:-8, 8:-8].max()) < 0.021  # 0.20
 
 
+@pytest.mark.parametrize(("near_px", "far_px"), [(-1.6, 0.0), (-8.0, -4.0), (-20.0, -12.0), (4.0, 6.0)])
+def test_a_known_background_shows_in_the_blurred_edge_of_a_surface_not_far_in_front(
+    near_px: float, far_px: float, engine: str
+) -> None:
+    """A straight edge, blurred by a disc, in front of white: a disc at s radii beside the edge is covered by a segment."""
+    is_near = torch.arange(160) < 80
+    coc = torch.where(is_near, near_px, far_px).expand(1, 1, 64, 160)
+    picture = in_front_of_white(torch.where(is_near, 0.02, 1.0).expand_as(coc), coc, far_px)
+    s = ((torch.arange(160) - 79.5) / abs(near_px)).clamp(-1.0, 1.0)
+    cover = 0.5 - (s * (1.0 - s * s).sqrt() + s.asin()) / math.pi
+    assert_close = partial(torch.testing.assert_close, rtol=0, atol=0.012)
+    assert_close(picture[0, 0, 32], 1.0 - 0.98 * cover)  # off by 0.1 to 0.3 if all light just behind is hidden
+
+
 def test_a_surface_just_in_front_of_another_one_hides_it() -> None:
     """Of the wall, and of posts just in front of it, the blur differs by 0.6 px."""
     scene = plane_scene(CLOSE, CAMERA.replace(focus_m=1.2), (110, 150), samples=64)

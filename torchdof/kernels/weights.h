@@ -12,11 +12,11 @@ struct Weights {
 };
 
 #if STACKED
-// Surfaces that cover a pixel independently, near to far; the formula of _stacked in render/surfaces/frame.py. Of surface j: its
-// h, the part of the light from behind that it hides in this layer and those behind it; passes, the part that its part in front of the
-// layer lets pass; s, the part of the arriving light that stops in the layer.
+// Surfaces that cover a pixel independently, near to far; the formula of _stacked in render/surfaces/frame.py. Of surface j: q, how far
+// the layer is clear of less blurred ones; h, the part of the light from behind that it hides in this layer and those behind it; passes,
+// the part that its part in front of the layer lets pass; s, the part of the arriving light that stops in the layer.
 struct Stack {
-  float h[SURFACES], passes[SURFACES], s[SURFACES];
+  float q[SURFACES], h[SURFACES], passes[SURFACES], s[SURFACES];
   // What the surfaces let pass, without one of them.
   __device__ float visible(int without = -1) const {
     float left = 1;
@@ -26,11 +26,15 @@ struct Stack {
 };
 // The share of a surface at or behind a layer nearby, over HIDING_SHARE, without limits.
 __device__ inline float nearby(const Ramps &l, float place) { return l.at_or_behind(end_of_surface(place)) / HIDING_SHARE; }
+// How far a surface hides the light from behind, by its share at or behind a layer and by that nearby, both over HIDING_SHARE.
+__device__ inline float hides(float own, float near, float q) { return (1 - q) * ramp(own, true) + q * ramp(near, true); }
 __device__ inline Stack stack_of(const Ramps &l, const Pixel &p) {
   Stack t;
   for (int j = 0; j < SURFACES; j++) {
     const float at_or_behind = ramp(l.at_or_behind(p.place[j]), true), share = at_or_behind - ramp(l.behind(p.place[j]), true);
-    t.h[j] = p.weight[j] * ramp(nearby(l, p.place[j]), true);
+    t.q[j] = 1;
+    for (int i = j + 1; i < SURFACES; i++) t.q[j] *= is_clear(p.place[j], p.place[i], p.weight[i], ramp(l.behind(p.place[i]), true));
+    t.h[j] = p.weight[j] * hides(at_or_behind / HIDING_SHARE, nearby(l, p.place[j]), t.q[j]);
     t.passes[j] = 1 - t.h[j] + t.h[j] * at_or_behind;
     t.s[j] = p.weight[j] * share / torchdof::max(t.passes[j], LEAST_PASSING);
   }
@@ -61,10 +65,12 @@ __device__ inline void weigh_back(const Ramps &l, const Pixel &p, const Weights 
     const float at_or_behind = ramp(l.at_or_behind(p.place[j]), true), share = at_or_behind - ramp(l.behind(p.place[j]), true);
     const float of_passes = of_visible * t.visible(j) - (t.passes[j] >= LEAST_PASSING ? of_s * t.s[j] / passing : 0.0f);
     const float of_h = of_passes * (at_or_behind - 1) + of_known * left_by(t.h, SURFACES, j), near = nearby(l, p.place[j]);
-    of_place[j] += (of_difference + of_passes * t.h[j]) * slope_of_ramp(l.at_or_behind(p.place[j]), true) / l.width;
-    of_place[j] += of_h * p.weight[j] * slope_of_ramp(near, true) * slope_of_end(p.place[j]) / (HIDING_SHARE * l.width);
+    const float of_own = of_h * p.weight[j] / HIDING_SHARE, own = at_or_behind / HIDING_SHARE;
+    const float of_share = of_difference + of_passes * t.h[j] + of_own * (1 - t.q[j]) * slope_of_ramp(own, true);
+    of_place[j] += of_share * slope_of_ramp(l.at_or_behind(p.place[j]), true) / l.width;
+    of_place[j] += of_own * t.q[j] * slope_of_ramp(near, true) * slope_of_end(p.place[j]) / l.width;
     of_place[j] -= of_difference * slope_of_ramp(l.behind(p.place[j]), true) / l.next_width;
-    of_weight[j] += of_s * share / passing + of_h * ramp(near, true);
+    of_weight[j] += of_s * share / passing + of_h * hides(own, near, t.q[j]);
   }
 }
 #else

@@ -612,8 +612,13 @@ class Composite {
       vec left = broadcast(1.0f), unknown = left, normalizer = left, share = {};
       for (int j = 0; j < s_.count; j++) {
         const vec p = load<vec>(place[j] + i), cover = load<vec>(weight[j] + i), h = at_or_behind(l, p, over_);
-        const vec near = unlimited_at_or_behind(l, end_of_surface(p)) / HIDING_SHARE;
-        const vec here = cover * ramp(near, true), there = 1.0f - here + here * h;
+        const vec own = ramp(h / HIDING_SHARE, true), near = unlimited_at_or_behind(l, end_of_surface(p));
+        vec slope = ramp(near / HIDING_SHARE, true) - own;
+        for (int k = j + 1; k < s_.count && any_of(slope > vec{}); k++) {
+          const vec farther = load<vec>(place[k] + i);
+          slope *= is_clear(p, farther, load<vec>(weight[k] + i), behind(l, farther, over_));
+        }
+        const vec here = cover * (own + slope), there = 1.0f - here + here * h;
         const vec stops = cover * (h - behind(l, p, over_)) / max(there, broadcast(LEAST_PASSING));
         m[j] = left * stops;
         left *= 1.0f - stops;

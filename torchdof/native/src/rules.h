@@ -189,6 +189,13 @@ inline V slope_of_end(V place) {
   return 1.0f + (SLOPES * absolute(place) < V{} + SLOPES_LEAST ? V{} : place < V{} ? V{} - SLOPES : V{} + SLOPES);
 }
 
+// How far a layer is clear of a farther surface, with a share behind the layer, that is less blurred than the one at
+// `place`. render/surfaces/frame.py, is_clear.
+template <typename V>
+inline V is_clear(V place, V farther, V cover, V beyond) {
+  return 1.0f - clamp01(absolute(place) - absolute(farther)) * cover * clamp01((1.0f - beyond) * (1.0f / HIDING_SHARE));
+}
+
 // Stand-ins for the background, each rule with its derivative. A surface at x counts as one at the focus by clamp(1 + x
 // / AT_FOCUS, 0, 1), and stands in by clamp(2 + x / BARELY_BLURRED, 0, 1) clamp(-x / OFF_FOCUS, 0, 1). With the weight
 // w it takes the place of a stand-in by clamp(COUNTED w, 0, 1), and has the weight max(w - SEEN_FROM, 0) as one.

@@ -257,25 +257,39 @@ def end_of_surface(x: Tensor) -> Tensor:
     return x + (_SLOPES * x.abs()).clamp_min(_SLOPES_LEAST)
 
 
+def is_clear(x: Tensor, farther_x: Tensor, cover: Tensor, beyond: Tensor) -> Tensor:
+    """How far a layer is clear, 0 to 1, of a less blurred surface behind a stacked surface at places ``x``.
+
+    ``beyond`` is this surface's share behind the layer, and ``cover`` the part of the pixel that it covers.
+    """
+    return 1.0 - (x.abs() - farther_x.abs()).clamp(0.0, 1.0) * cover * ((1.0 - beyond) / _HIDING_SHARE).clamp(max=1.0)
+
+
 def _stacked(
     surfaces: Sequence[PaddedSurface], pairs: Sequence[tuple[Tensor, Tensor]], nearby: Sequence[Tensor]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """``m_k I``, ``m_k`` and ``M_k - m_k`` of surfaces that cover a pixel independently, near to far.
 
     With ``c`` the cover of a surface, ``b`` its share at or behind layer k, ``n`` the same share of
-    :func:`end_of_surface`, ``f`` the share :data:`_HIDING_SHARE` and ``h = c eased(min(n / f, 1))``,
+    :func:`end_of_surface`, ``f`` the share :data:`_HIDING_SHARE`, ``e(b) = eased(min(b / f, 1))``, ``q`` the product of
+    :func:`is_clear` over the farther surfaces and ``h = c (e(b) + q (e(n) - e(b)))``,
 
         ``M_k = prod(1 - h (1 - b)) (1 - prod(1 - h))``,
 
     products over the surfaces: the known part of the pixel at or behind layer k, less the parts of the same surfaces
-    in front of it, behind which light from farther surfaces would pass between the layers of a slope.
+    in front of it, behind which light from farther surfaces would pass between the layers of a slope. A less blurred
+    surface keeps its own layers, as its small kernels reach nothing from beside the pixel. ``q`` has no gradient.
     """
+    covers = [torch.ones_like(x) if weight is None else weight for _, x, weight in surfaces]
     visible = torch.ones_like(surfaces[0].x)
     arriving = unknown = visible
     stopped = []
-    for (_, x, weight), (behind, beyond), near in zip(surfaces, pairs, nearby, strict=True):
-        cover = torch.ones_like(x) if weight is None else weight
-        here = cover * eased((near / _HIDING_SHARE).clamp(max=1.0))
+    for j, ((_, x, _), (behind, beyond), near) in enumerate(zip(surfaces, pairs, nearby, strict=True)):
+        cover, clear = covers[j], torch.ones_like(behind)
+        for (_, farther_x, _), farther_cover, (_, farther) in list(zip(surfaces, covers, pairs, strict=True))[j + 1 :]:
+            clear = clear * is_clear(x, farther_x, farther_cover, farther).detach()
+        own, slope = (eased((share / _HIDING_SHARE).clamp(max=1.0)) for share in (behind, near))
+        here = cover * (own + clear * (slope - own))
         # share not hidden by the surface's part in front of layer k: 1 - h (1 - b) as a sum of positive terms
         passes = (1.0 - here) + here * behind
         # share of the arriving light stopped in layer k
