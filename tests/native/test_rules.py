@@ -132,9 +132,9 @@ def test_rules_at_points_computed_by_hand() -> None:
     assert frame.visible_part(torch.tensor([0.0, 0.03, 0.5])).tolist() == pytest.approx([1.0, 0.5, 0.0])
     cover = torch.tensor([0.003, 0.053, 0.6])
     assert frame.continuation_weight(cover).tolist() == pytest.approx([0.0, 0.4735, 0.4])
-    farther, cover, beyond = torch.tensor([[-1.0, -2.5, -1.0, -1.0], [1.0, 1.0, 0.5, 1.0], [1.0, 0.0, 0.0, 0.97]])
-    assert frame.is_clear(torch.tensor(-3.0), farther, cover, beyond).tolist() == pytest.approx([1.0, 0.5, 0.5, 0.5])
-    assert frame.end_of_surface(torch.tensor([-8.0, -1.0, 0.0, 4.0])).tolist() == [-4.0, 0.0, 1.0, 6.0]
+    farther, cover, beyond = torch.tensor([[-1.0, -2.9, -1.0, -1.0], [1.0, 1.0, 0.5, 1.0], [1.0, 0.0, 0.0, 0.97]])
+    assert frame.is_clear(torch.tensor(-4.0), farther, cover, beyond).tolist() == pytest.approx([1.0, 0.5, 0.5, 0.5])
+    assert frame.end_of_surface(torch.tensor([-8.0, -1.0, 0.0, 6.0])).tolist() == pytest.approx([-5.2, 0.0, 1.0, 8.1])
     assert frame.at_focus(torch.tensor([-1.0, -0.1, 0.0, 5.0])).tolist() == pytest.approx([0.0, 0.75, 1.0, 1.0])
     assert frame.stands_in(torch.tensor([-3.5, -2.25, -1.0, -0.0125, 1.0])).tolist() == pytest.approx(
         [0, 0.5, 1, 0.25, 0]

@@ -27,7 +27,7 @@ struct Stack {
 // The share of a surface at or behind a layer nearby, over HIDING_SHARE, without limits.
 __device__ inline float nearby(const Ramps &l, float place) { return l.at_or_behind(end_of_surface(place)) / HIDING_SHARE; }
 // How far a surface hides the light from behind, by its share at or behind a layer and by that nearby, both over HIDING_SHARE.
-__device__ inline float hides(float own, float near, float q) { return (1 - q) * ramp(own, true) + q * ramp(near, true); }
+__device__ inline float hides(float own, float near, float q) { return ramp(own, true) + q * (ramp(near, true) - ramp(own, true)); }
 __device__ inline Stack stack_of(const Ramps &l, const Pixel &p) {
   Stack t;
   for (int j = 0; j < SURFACES; j++) {

@@ -20,7 +20,7 @@ using constants::doubt::APART_PX, constants::doubt::SHARPER;
 using constants::frame::AT_FOCUS, constants::frame::OFF_FOCUS, constants::frame::BARELY_BLURRED;
 using constants::frame::CONTINUES_FROM, constants::frame::COUNTED, constants::frame::HIDDEN_WEIGHT;
 using constants::frame::HIDING_SHARE, constants::frame::LEAST_PASSING, constants::frame::SEEN_FROM;
-using constants::frame::SLOPES, constants::frame::SLOPES_LEAST;
+using constants::frame::LESS_BLURRED, constants::frame::SLOPES, constants::frame::SLOPES_LEAST;
 using constants::matting::ON_FAR_TO, constants::matting::ON_NEAR_FROM, constants::matting::PLACE_SLOPE;
 using constants::matting::SAME_BLUR, constants::matting::SIDED_FROM;
 constexpr float FOOT = constants::layer_weights::FOOT;
@@ -193,7 +193,8 @@ inline V slope_of_end(V place) {
 // `place`. render/surfaces/frame.py, is_clear.
 template <typename V>
 inline V is_clear(V place, V farther, V cover, V beyond) {
-  return 1.0f - clamp01(absolute(place) - absolute(farther)) * cover * clamp01((1.0f - beyond) * (1.0f / HIDING_SHARE));
+  const V less_blurred = clamp01(LESS_BLURRED * absolute(place) - absolute(farther));
+  return 1.0f - less_blurred * cover * clamp01((1.0f - beyond) * (1.0f / HIDING_SHARE));
 }
 
 // Stand-ins for the background, each rule with its derivative. A surface at x counts as one at the focus by clamp(1 + x

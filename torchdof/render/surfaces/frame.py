@@ -23,8 +23,9 @@ HIDDEN_WEIGHT = 0.003
 
 _HIDING_SHARE = 0.06
 """Share of a surface at or behind a layer at which it counts there in full; larger: it fades in over more depth."""
-_SLOPES, _SLOPES_LEAST = 0.5, 1.0
+_SLOPES, _SLOPES_LEAST = 0.35, 1.0
 """A stacked surface may be farther nearby by this part of its place on the blur axis, and by this at least."""
+_LESS_BLURRED = 0.85  # blur of a surface that keeps its layers behind another one, over that one's, at most
 _LEAST_PASSING = 1e-6  # smallest divisor: share of the light that passes the part of a surface in front of a layer
 _CONTINUES_FROM = 0.1
 """Visible share of a far surface, above HIDDEN_WEIGHT, at which it continues in full behind the near one."""
@@ -262,7 +263,8 @@ def is_clear(x: Tensor, farther_x: Tensor, cover: Tensor, beyond: Tensor) -> Ten
 
     ``beyond`` is this surface's share behind the layer, and ``cover`` the part of the pixel that it covers.
     """
-    return 1.0 - (x.abs() - farther_x.abs()).clamp(0.0, 1.0) * cover * ((1.0 - beyond) / _HIDING_SHARE).clamp(max=1.0)
+    less_blurred = (_LESS_BLURRED * x.abs() - farther_x.abs()).clamp(0.0, 1.0)
+    return 1.0 - less_blurred * cover * ((1.0 - beyond) / _HIDING_SHARE).clamp(max=1.0)
 
 
 def _stacked(
