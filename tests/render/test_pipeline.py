@@ -133,7 +133,7 @@ def test_a_known_background_does_not_shine_through_pixels_of_two_other_surfaces(
 def test_a_known_background_shows_in_the_blurred_edge_of_a_surface_not_far_in_front(
     near_px: float, far_px: float, engine: str
 ) -> None:
-    """A straight edge, blurred by a disc, in front of white: a disc at s radii beside the edge is covered by a segment."""
+    """A straight edge is blurred by discs: of one that is s radii beside it, a segment is covered."""
     is_near = torch.arange(160) < 80
     coc = torch.where(is_near, near_px, far_px).expand(1, 1, 64, 160)
     picture = in_front_of_white(torch.where(is_near, 0.02, 1.0).expand_as(coc), coc, far_px)
