@@ -91,7 +91,7 @@ def _blurred(given: Tensor, repaired: Tensor, doubt: Tensor) -> Tensor:
     moved = torch.where(valid, (repaired - given).abs() / _MOVED_PX - 0.5, 0.0).clamp(0.0, 1.0)
     nearness = torch.where(valid, -repaired, -NEVER)
     near = highest(nearness, _REACH)
-    # compared with surfaces twice as far away: each pixel in reach of one compares its surroundings with the same one
+    # a pixel beside a surface compares its surroundings with that surface, which may be twice the reach away from them
     is_near = (_NEAR_SLOPE * (nearness / highest(near, _REACH).clamp_min(1.0) - _NEAR_FROM)).clamp(0.0, 1.0)
     is_beyond = (near - hiding_px(nearness.abs()) + 0.5).clamp(0.0, 1.0) * highest(moved, _REACH)
     beside = is_beyond * _OF_NEAR * near * (2.0 * mean_around(is_near, _REACH)).clamp(max=1.0)

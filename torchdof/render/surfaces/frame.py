@@ -259,9 +259,9 @@ def end_of_surface(x: Tensor) -> Tensor:
 
 
 def is_clear(x: Tensor, farther_x: Tensor, cover: Tensor, beyond: Tensor) -> Tensor:
-    """How far a layer is clear, 0 to 1, of a less blurred surface behind a stacked surface at places ``x``.
+    """How far a layer is clear, 0 to 1, of a surface at places ``farther_x`` that is less blurred than one at ``x``.
 
-    ``beyond`` is this surface's share behind the layer, and ``cover`` the part of the pixel that it covers.
+    ``beyond`` is the farther surface's share behind the layer, and ``cover`` the part of the pixel that it covers.
     """
     less_blurred = (_LESS_BLURRED * x.abs() - farther_x.abs()).clamp(0.0, 1.0)
     return 1.0 - less_blurred * cover * ((1.0 - beyond) / _HIDING_SHARE).clamp(max=1.0)
