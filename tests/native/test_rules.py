@@ -26,7 +26,7 @@ RULES: dict[str, Callable[[Tensor], Tensor]] = {
     "on_far(v)[0]": matting._on_far,
     "clamp01(unlimited_sided(v))[0]": lambda x: (matting.PLACE_SLOPE * (x - matting._SIDED_FROM)).clamp(0.0, 1.0),
     "hiding_px(x)": doubt.hiding_px,
-    "end_of_slope(x)": disocclusion.end_of_slope,
+    "own_end(x)": disocclusion.own_end,
     "is_another_surface(x)": disocclusion.is_another_surface,
     "is_another_surface(v)[0]": disocclusion.is_another_surface,
     "on_one_side(v, broadcast(3.7f))[0]": lambda x: disocclusion._on_one_side(x, torch.full_like(x, 3.7)),
@@ -48,7 +48,7 @@ RULES: dict[str, Callable[[Tensor], Tensor]] = {
 }
 # C++ expression of a derivative -> the rule
 SLOPES: dict[str, str] = {
-    "rate_of_end(x)": "end_of_slope(x)",
+    "slope_of_own_end(x)": "own_end(x)",
     "slope_of_ramp(v, true)[0]": "ramp(v, true)[0]",
     "slope_of_ramp(v, false)[0]": "ramp(x, false)",
     "slope_of_continuation(v)[0]": "continuation(v)[0]",
@@ -124,7 +124,7 @@ def test_every_rule_of_the_header_is_compared() -> None:
 
 def test_rules_at_points_computed_by_hand() -> None:
     assert disocclusion.is_another_surface(torch.tensor([0.5, 1.0, 1.5])).tolist() == [0.0, 0.5, 1.0]
-    assert disocclusion.end_of_slope(torch.tensor([-8.0, -2.0, 2.0, 8.0])).tolist() == [-7.0, -2.0, 2.0, 9.0]
+    assert disocclusion.own_end(torch.tensor([-8.0, -2.0, 2.0, 8.0])).tolist() == [-7.0, -2.0, 2.0, 9.0]
     mean = torch.tensor([-8.0, 1.0, 1.0, 0.0, 0.0])
     one_side = disocclusion._on_one_side(mean, torch.tensor([8.0, 4.5, 8.0, 0.0, 0.3]))
     assert one_side.tolist() == pytest.approx([1.0, 0.5, 0.0, 1.0, 0.7])

@@ -77,7 +77,7 @@ struct Sample {
     level_weight = is_read(std::fabs(here), level.least_px);
     weight = 0;
     if (!(level_weight > 0)) return;
-    const float end = end_of_slope(here), down = row.part, right = column.part;
+    const float end = own_end(here), down = row.part, right = column.part;
     const float share[4] = {(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right};
     const float *corners[4];
     float total = 0, counts[4];
@@ -519,7 +519,7 @@ class Filling {
     constexpr int VECTORS = CELL / LANES, ROWS = CELL / 2 + 2;
     const int means = (CHANNELS ? CHANNELS : C_) + 1, planes = means + 2;
     const size_t beside = (size_t)planes * VECTORS, below = 2 * beside, of_level = ROWS * below;
-    const vec size = max(here, -here), end = end_of_slope(here);
+    const vec size = max(here, -here), end = own_end(here);
     vec total = {};
     for (int k = 0; k <= means; k++) mean[k] = vec{};
     for (int i = to.first; i < to.count; i++) {

@@ -126,7 +126,7 @@ struct Behind {
     const float *const cocs = level.values + (planes() - 2) * size, *const weights = cocs + size;
     const int row = rows[l].before[y], column = columns[l].before[x];
     const float below = rows[l].part[y], aside = columns[l].part[x];
-    const float end = end_of_slope(coc);
+    const float end = own_end(coc);
     bool any = false;
     for (int j = 0; j < 4; j++) {
       f.at[j] = (size_t)(row + j / 2) * level.columns + column + j % 2;
@@ -314,7 +314,7 @@ struct Behind {
         if (!within(f.is_behind[j])) continue;
         const float d_distance = d_part * f.share[j] * value[(planes() - 1) * size];
         d_value[(planes() - 2) * size] += d_distance;
-        d_least -= d_distance * rate_of_end(least);
+        d_least -= d_distance * slope_of_own_end(least);
       }
     }
     // the gradient of equal coc is shared by columns, then by rows

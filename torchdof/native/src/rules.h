@@ -73,12 +73,12 @@ inline V unlimited_sided(V sided) {
 }
 
 // Largest coc of a pixel's own surface nearby, which may slope: c + max(OWN_SLOPE |c| - BEHIND_PX, 0); and its
-// derivative. render/surfaces/disocclusion.py, end_of_slope.
+// derivative. render/surfaces/disocclusion.py, own_end.
 template <typename V>
-inline V end_of_slope(V coc) {
+inline V own_end(V coc) {
   return coc + max(absolute(coc) * OWN_SLOPE - BEHIND_PX, V{});
 }
-inline float rate_of_end(float coc) {
+inline float slope_of_own_end(float coc) {
   return OWN_SLOPE * absolute(coc) >= BEHIND_PX ? 1.0f + (coc < 0 ? -OWN_SLOPE : OWN_SLOPE) : 1.0f;
 }
 

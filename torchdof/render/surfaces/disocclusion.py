@@ -118,7 +118,7 @@ def is_another_surface(distance_px: Tensor) -> Tensor:
     return (distance_px - _BEHIND_PX + 0.5).clamp(0.0, 1.0)
 
 
-def end_of_slope(coc_px: Tensor) -> Tensor:
+def own_end(coc_px: Tensor) -> Tensor:
     """Largest coc of a pixel's own surface nearby, which may slope, of the coc of the pixel."""
     slope = _OWN_SLOPE if active().own_slope else 0.0
     return coc_px + (slope * coc_px.abs() - _BEHIND_PX).clamp_min(0.0)
@@ -489,7 +489,7 @@ def counted_behind(samples: Tensor, share: Tensor, coc_px: Tensor, channels: int
     """
     count = samples.shape[channels] - 2
     coc, weight = samples.narrow(channels, count, 1), samples.narrow(channels, count + 1, 1)
-    part = share * weight * is_another_surface(coc - end_of_slope(coc_px))
+    part = share * weight * is_another_surface(coc - own_end(coc_px))
     return samples.narrow(channels, 0, count + 1) * part, part
 
 

@@ -282,13 +282,16 @@ def _stacked(
     in front of it, behind which light from farther surfaces would pass between the layers of a slope. A less blurred
     surface keeps its own layers, as its small kernels reach nothing from beside the pixel. ``q`` has no gradient.
     """
-    covers = [torch.ones_like(x) if weight is None else weight for _, x, weight in surfaces]
+    known = [
+        (x, torch.ones_like(x) if weight is None else weight, *pair)
+        for (_, x, weight), pair in zip(surfaces, pairs, strict=True)
+    ]
     visible = torch.ones_like(surfaces[0].x)
     arriving = unknown = visible
     stopped = []
-    for j, ((_, x, _), (behind, beyond), near) in enumerate(zip(surfaces, pairs, nearby, strict=True)):
-        cover, clear = covers[j], torch.ones_like(behind)
-        for (_, farther_x, _), farther_cover, (_, farther) in list(zip(surfaces, covers, pairs, strict=True))[j + 1 :]:
+    for j, ((x, cover, behind, beyond), near) in enumerate(zip(known, nearby, strict=True)):
+        clear = torch.ones_like(behind)
+        for farther_x, farther_cover, _, farther in known[j + 1 :]:
             clear = clear * is_clear(x, farther_x, farther_cover, farther).detach()
         own, slope = (eased((share / _HIDING_SHARE).clamp(max=1.0)) for share in (behind, near))
         here = cover * (own + clear * (slope - own))
