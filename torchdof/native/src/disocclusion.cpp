@@ -12,6 +12,7 @@
 #include "blur_axis.h"
 #include "highlights.h"
 #include "job.h"
+#include "light.h"
 #include "memory.h"
 #include "rules.h"
 #include "simd.h"
@@ -351,9 +352,12 @@ class Filling {
   }
 
   bool wanted(int y, int x) const {
-    const int which = s_.block_of(y, x);
-    if (!(std::fabs(s_.coc[s_.pixel(y, x)]) > HIDING_FROM_PX)) return false;
-    return !s_.has_block(which) || s_.block(which).weight[y % BLOCK * BLOCK + x % BLOCK] < 0.5f * HIDDEN_WEIGHT;
+    const int which = s_.block_of(y, x), within = place_in_block(y, x);
+    const float blur = std::fabs(s_.coc[s_.pixel(y, x)]);
+    if (!(blur > HIDING_FROM_PX)) return false;
+    if (!s_.has_block(which)) return true;
+    const Block b = s_.block(which);
+    return b.weight[within] < 0.5f * HIDDEN_WEIGHT || blur > std::fabs(b.coc[within]);
   }
 
   // Positions of pixels first, first + step, ... in a level.
@@ -560,7 +564,7 @@ class Filling {
   //
   // 1. Copy each level's samples so that the four around each of LANES pixels are vectors.
   // 2. For each vector of pixels and each level, take the mean of the samples behind them, and add it by its votes.
-  // 3. Replace the second surfaces of the pixels that any level voted for.
+  // 3. Replace the second surfaces of the pixels that any level voted for, those with a small share in part.
   template <int CHANNELS>
   void fill_cell(int y0, int x0, CellLevels &to) {
     constexpr int VECTORS = CELL / LANES, ROWS = CELL / 2 + 2;
@@ -581,26 +585,40 @@ class Filling {
       if (columns < CELL) here_of = (const float *)memcpy(cut, here_of, columns * sizeof(float));
       for (int v = 0; v < VECTORS; v++) {
         const vec here = load<vec>(here_of + v * LANES), size = max(here, -here);
-        ivec wanted = size > HIDING_FROM_PX;
-        if (s_.has_block(which))
-          wanted &= load<vec>(s_.block(which).weight + within + v * LANES) < broadcast(0.5f * HIDDEN_WEIGHT);
+        const size_t at = within + v * LANES;
+        vec mixed{}, sharper{};
+        if (s_.has_block(which)) {
+          const Block b = s_.block(which);
+          mixed = load<vec>(b.weight + at), sharper = clamp01(size - abs(load<vec>(b.coc + at)));
+        }
+        const ivec is_counted = mixed >= broadcast(0.5f * HIDDEN_WEIGHT);
+        ivec wanted = (size > HIDING_FROM_PX) & (~is_counted | (sharper > vec{}));
         if (!any_of(wanted)) continue;
         const vec total = mean_behind<CHANNELS>(to, first_rows, here, y0 + y, x0, v, columns, mean);
         wanted &= total > vec{};
         if (!any_of(wanted)) continue;
-        // replaces a second surface to which matting gave a small weight
+        // replaces a second surface to which matting gave a small weight, and the light of one with a small share
         const Block b = s_.make_block(which);
-        const size_t at = within + v * LANES;
-        const vec mixed = load<vec>(b.weight + at),
-                  certain = min(total * (1.0f / CERTAIN), broadcast(1.0f)) * on_one_side(mean[C + 1], mean[C]);
+        const ivec is_replaced = wanted & ~is_counted;
+        const vec certain = min(total * (1.0f / CERTAIN), broadcast(1.0f)) * on_one_side(mean[C + 1], mean[C]);
         const vec hidden = as_hidden(certain * (HIDDEN_WEIGHT - 2.0f * mixed));
-        auto replace = [&](float *other, vec hidden_one) { store(other, wanted ? hidden_one : load<vec>(other)); };
+        const vec is_other = is_another_surface(abs(mean[C + 1] - load<vec>(b.coc + at)));
+        const vec lent = sharper * certain * (1.0f - is_other) * clamp01(1.0f - 2.0f * mixed);
+        vec part = wanted ? lent : vec{}, valid = broadcast(1.0f);
+        for (int x = 0; x < std::min(LANES, columns - v * LANES); x++) {
+          const int row = y0 + y, column = x0 + v * LANES + x;
+          if (s_.valid) valid[x] = s_.valid[s_.pixel(row, column)];
+          if (is_replaced[x] || !(part[x] > 0)) continue;
+          const float peak = peak_of(b.other + at + x, BLOCK_PIXELS, C);
+          part[x] *= clamp01(2.0f - 2.0f * (peak / std::max(threshold_at(job_, row, column), TINY)));
+        }
+        const auto replace = [&](float *other, vec seen) {
+          const vec kept = load<vec>(other);
+          store(other, is_replaced ? seen : kept + part * (seen - kept));
+        };
         for (int c = 0; c < C; c++) replace(b.other + c * BLOCK_PIXELS + at, mean[c]);
         replace(b.coc + at, mean[C + 1]);
-        vec valid = broadcast(1.0f);
-        for (int x = 0; s_.valid && x < std::min(LANES, columns - v * LANES); x++)
-          valid[x] = s_.valid[s_.pixel(y0 + y, x0 + v * LANES + x)];
-        store(b.weight + at, wanted ? hidden * valid : mixed);
+        store(b.weight + at, is_replaced ? hidden * valid : mixed);
       }
     }
   }

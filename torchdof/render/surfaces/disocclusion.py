@@ -67,6 +67,8 @@ def surfaces_of_image(
        blur: deeper inside, hidden surfaces never show. A slightly farther sample counts as part of the same surface if
        that is strongly blurred, as a slope is not its own background.
     6. Replace second surfaces that are hardly mixed in by the hidden sample.
+    7. A small share of a pixel tells little of the light of a sharper surface: the less it is, the more that of the
+       samples on the same surface replaces it. It keeps the light of a highlight, which they do not have.
 
     Args:
         light: ``[B, C, H, W]``.
@@ -206,21 +208,26 @@ def _surfaces_of_image(
     counted = other_weight * mixed.clamp(0.0, 1.0)
 
     pyramid = _pyramid(matted, coc_px, threshold, valid, levels)
-    wanted = ((coc_px.abs() > _HIDING_FROM_PX) & (mixed < 0)).to(coc_px.dtype)
+    sharper = (coc_px.abs() - other_coc.abs()).clamp(0.0, 1.0)
+    wanted = ((coc_px.abs() > _HIDING_FROM_PX) & ((mixed < 0) | (sharper > 0))).to(coc_px.dtype)
     behind, searched = _light_behind(pyramid, coc_px, wanted, ops)
     seen, total = ops.seen(_seen, searched, coc_px, wanted)
+    seen_light, blur, seen_coc = seen.split([light.shape[1], 1, 1], 1)
+    certain = (total / _CERTAIN).clamp(max=1.0)
+    if active().one_side:
+        certain = certain * _on_one_side(seen_coc, blur)
+    if not active().filling:
+        certain = torch.zeros_like(certain)
 
     # Up to HIDDEN_WEIGHT / 2 a mixed sample does not count, and the hidden one replaces it. Both weights are 0 at the
     # limit, where light and coc jump from one to the other.
-    hidden = (total * (-HIDDEN_WEIGHT / _CERTAIN)).clamp_min(-HIDDEN_WEIGHT) * mixed.clamp(max=0.0)
-    if not active().filling:
-        hidden = torch.zeros_like(hidden)
-    seen_light, blur, seen_coc = seen.split([light.shape[1], 1, 1], 1)
-    if active().one_side:
-        hidden = hidden * _on_one_side(seen_coc, blur)
-    is_hidden = hidden > 0
-    other = torch.where(is_hidden, seen_light, other)
-    other_coc = torch.where(is_hidden, seen_coc, other_coc)
+    hidden = certain * (-HIDDEN_WEIGHT * mixed.clamp(max=0.0))
+    replaced = torch.where(hidden > 0, 1.0, 0.0)
+    if active().small_shares:
+        peak = other.amax(1, keepdim=True) / threshold.clamp_min(torch.finfo(threshold.dtype).tiny)
+        same = (1.0 - is_another_surface((seen_coc - other_coc).abs())) * (2.0 - 2.0 * peak).clamp(0.0, 1.0)
+        replaced = torch.where(hidden > 0, 1.0, sharper * certain * same * (1.0 - 2.0 * other_weight).clamp_min(0.0))
+    other, other_coc = torch.lerp(other, seen_light, replaced), torch.lerp(other_coc, seen_coc, replaced)
     own_weight, other_weight = 1.0 - counted, hidden + counted
     if valid is not None:
         own_weight, other_weight = own_weight * valid, other_weight * valid
