@@ -31,7 +31,7 @@ class Rules:
     emitters: bool = _rule("gives a highlight's light to the surface of its emitter")
     own_emitters: bool = _rule("the same where the emitter lies on the pixel's own surface")
     filling: bool = _rule("fills hidden surfaces behind blurred foregrounds")
-    small_shares: bool = _rule("takes the light of a sharper surface's small share from around the pixel")
+    small_shares: bool = _rule("lets hidden samples take the place of small shares of a pixel")
     light_behind: bool = _rule("puts light behind the hidden surface")
     own_slope: bool = _rule("takes a slightly farther sample for the same, sloping surface")
     one_side: bool = _rule("fades hidden samples that mix both sides of the focus")

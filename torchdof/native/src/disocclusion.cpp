@@ -39,10 +39,16 @@ struct Level {
   float coc(int y, int x) const { return at(y, x)[means]; }
 };
 
-// While hidden surfaces are filled, the sign of a second surface's weight gives its kind: minus for a hidden surface,
-// plus for one that matting found.
-inline vec as_hidden(vec weight) { return -weight; }
-inline bool is_hidden(float weight) { return weight < 0; }
+// While hidden surfaces are filled, the sign of a second surface's weight is minus where it is the final one.
+inline vec as_final(vec weight) { return -weight; }
+inline bool is_final(float weight) { return weight < 0; }
+
+// What counts of a mixed pixel's second surface: small weights fall to 0, so that a hidden surface can take their place
+// without a step.
+template <typename V>
+inline V counted_of(V mixed) {
+  return mixed * clamp01(mixed * (2.0f / HIDDEN_WEIGHT) - 1.0f);
+}
 
 typedef float f8 __attribute__((vector_size(32)));
 constexpr int F8 = 8;
@@ -162,16 +168,17 @@ class Filling {
       job_.parallel(ceil_div(pyramid_[i].height, BAND), [&](int band, int) { coarser(i, band); });
     job_.parallel(cell_rows_, [&](int row, int) { find_cells(row); });
     fill();
-    // Small weights of mixed pixels' second surfaces fall to 0, so that a hidden surface can take their place without a
-    // step.
     job_.parallel((int)s_.blocks.size(), [&](int i, int) {
       if (!s_.has_block(i)) return;
       const Block b = s_.block(i);
       for (int at = 0; at < BLOCK_PIXELS; at++) {
-        const float mixed = b.weight[at],
-                    counted = std::max(mixed, 0.0f) * clamp01(mixed * (2.0f / HIDDEN_WEIGHT) - 1.0f);
-        b.weight[at] = is_hidden(mixed) ? -mixed : counted;
-        b.own_weight[at] = b.own_weight[at] > 0 ? 1.0f - counted : 0.0f;
+        float &weight = b.weight[at];
+        if (is_final(weight)) {
+          weight = -weight;
+          continue;
+        }
+        weight = counted_of(weight);
+        b.own_weight[at] = b.own_weight[at] > 0 ? 1.0f - weight : 0.0f;
       }
     });
   }
@@ -351,14 +358,7 @@ class Filling {
     }
   }
 
-  bool wanted(int y, int x) const {
-    const int which = s_.block_of(y, x), within = place_in_block(y, x);
-    const float blur = std::fabs(s_.coc[s_.pixel(y, x)]);
-    if (!(blur > HIDING_FROM_PX)) return false;
-    if (!s_.has_block(which)) return true;
-    const Block b = s_.block(which);
-    return b.weight[within] < 0.5f * HIDDEN_WEIGHT || blur > std::fabs(b.coc[within]);
-  }
+  bool wanted(int y, int x) const { return std::fabs(s_.coc[s_.pixel(y, x)]) > HIDING_FROM_PX; }
 
   // Positions of pixels first, first + step, ... in a level.
   static std::vector<Place> places(float first, int step, int count, int size, float (Level::*place)(float) const,
@@ -564,7 +564,7 @@ class Filling {
   //
   // 1. Copy each level's samples so that the four around each of LANES pixels are vectors.
   // 2. For each vector of pixels and each level, take the mean of the samples behind them, and add it by its votes.
-  // 3. Replace the second surfaces of the pixels that any level voted for, those with a small share in part.
+  // 3. Fill the second surfaces of the pixels that any level voted for; what matting gave them stays by its share.
   template <int CHANNELS>
   void fill_cell(int y0, int x0, CellLevels &to) {
     constexpr int VECTORS = CELL / LANES, ROWS = CELL / 2 + 2;
@@ -585,40 +585,37 @@ class Filling {
       if (columns < CELL) here_of = (const float *)memcpy(cut, here_of, columns * sizeof(float));
       for (int v = 0; v < VECTORS; v++) {
         const vec here = load<vec>(here_of + v * LANES), size = max(here, -here);
-        const size_t at = within + v * LANES;
-        vec mixed{}, sharper{};
-        if (s_.has_block(which)) {
-          const Block b = s_.block(which);
-          mixed = load<vec>(b.weight + at), sharper = clamp01(size - abs(load<vec>(b.coc + at)));
-        }
-        const ivec is_counted = mixed >= broadcast(0.5f * HIDDEN_WEIGHT);
-        ivec wanted = (size > HIDING_FROM_PX) & (~is_counted | (sharper > vec{}));
-        if (!any_of(wanted)) continue;
+        ivec filled = size > HIDING_FROM_PX;
+        if (!any_of(filled)) continue;
         const vec total = mean_behind<CHANNELS>(to, first_rows, here, y0 + y, x0, v, columns, mean);
-        wanted &= total > vec{};
-        if (!any_of(wanted)) continue;
-        // replaces a second surface to which matting gave a small weight, and the light of one with a small share
-        const Block b = s_.make_block(which);
-        const ivec is_replaced = wanted & ~is_counted;
         const vec certain = min(total * (1.0f / CERTAIN), broadcast(1.0f)) * on_one_side(mean[C + 1], mean[C]);
-        const vec hidden = as_hidden(certain * (HIDDEN_WEIGHT - 2.0f * mixed));
-        const vec is_other = is_another_surface(abs(mean[C + 1] - load<vec>(b.coc + at)));
-        const vec lent = sharper * certain * (1.0f - is_other) * clamp01(1.0f - 2.0f * mixed);
-        vec part = wanted ? lent : vec{}, valid = broadcast(1.0f);
+        if (!any_of(filled & (certain > vec{}))) continue;
+        const Block b = s_.make_block(which);
+        const size_t at = within + v * LANES;
+        const vec mixed = load<vec>(b.weight + at), coc = load<vec>(b.coc + at), own = load<vec>(b.own_weight + at);
+        // how far the samples may take the part of the other surface: a small one that is no highlight
+        vec alike = clamp01(1.0f - 2.0f * mixed) * (1.0f - is_another_surface(abs(mean[C + 1] - coc)));
+        vec valid = broadcast(1.0f);
         for (int x = 0; x < std::min(LANES, columns - v * LANES); x++) {
           const int row = y0 + y, column = x0 + v * LANES + x;
           if (s_.valid) valid[x] = s_.valid[s_.pixel(row, column)];
-          if (is_replaced[x] || !(part[x] > 0)) continue;
+          if (!(mixed[x] > 0) || !(alike[x] > 0)) continue;
           const float peak = peak_of(b.other + at + x, BLOCK_PIXELS, C);
-          part[x] *= clamp01(2.0f - 2.0f * (peak / std::max(threshold_at(job_, row, column), TINY)));
+          alike[x] *= clamp01(2.0f - 2.0f * (peak / std::max(threshold_at(job_, row, column), TINY)));
         }
-        const auto replace = [&](float *other, vec seen) {
-          const vec kept = load<vec>(other);
-          store(other, is_replaced ? seen : kept + part * (seen - kept));
+        const vec missing = clamp01(1.0f - mixed * (2.0f / HIDDEN_WEIGHT)), counted = counted_of(mixed);
+        const vec hidden = HIDDEN_WEIGHT * certain * (missing + (1.0f - missing) * alike);
+        filled &= hidden > vec{};
+        const vec sharper = clamp01(size - abs(coc)), lent = sharper * certain * alike;
+        const vec kept = (1.0f - lent) * counted / max(hidden + counted, broadcast(1e-12f));
+        const auto fill = [&](float *other, vec seen) {
+          const vec given = load<vec>(other);
+          store(other, filled ? seen + kept * (given - seen) : given);
         };
-        for (int c = 0; c < C; c++) replace(b.other + c * BLOCK_PIXELS + at, mean[c]);
-        replace(b.coc + at, mean[C + 1]);
-        store(b.weight + at, is_replaced ? hidden * valid : mixed);
+        for (int c = 0; c < C; c++) fill(b.other + c * BLOCK_PIXELS + at, mean[c]);
+        fill(b.coc + at, mean[C + 1]);
+        store(b.weight + at, filled ? as_final((hidden + counted) * valid) : mixed);
+        store(b.own_weight + at, filled & (own > vec{}) ? 1.0f - counted : own);
       }
     }
   }

@@ -67,8 +67,8 @@ def surfaces_of_image(
        blur: deeper inside, hidden surfaces never show. A slightly farther sample counts as part of the same surface if
        that is strongly blurred, as a slope is not its own background.
     6. Replace second surfaces that are hardly mixed in by the hidden sample.
-    7. A small share of a pixel tells little of the light of a sharper surface: the less it is, the more that of the
-       samples on the same surface replaces it. It keeps the light of a highlight, which they do not have.
+    7. A small share of a pixel tells little of the light of a sharper surface: the less it is, the more the hidden
+       sample replaces it, if that lies on the same surface. Highlights stay, which hidden samples do not have.
 
     Args:
         light: ``[B, C, H, W]``.
@@ -208,8 +208,7 @@ def _surfaces_of_image(
     counted = other_weight * mixed.clamp(0.0, 1.0)
 
     pyramid = _pyramid(matted, coc_px, threshold, valid, levels)
-    sharper = (coc_px.abs() - other_coc.abs()).clamp(0.0, 1.0)
-    wanted = ((coc_px.abs() > _HIDING_FROM_PX) & ((mixed < 0) | (sharper > 0))).to(coc_px.dtype)
+    wanted = (coc_px.abs() > _HIDING_FROM_PX).to(coc_px.dtype)
     behind, searched = _light_behind(pyramid, coc_px, wanted, ops)
     seen, total = ops.seen(_seen, searched, coc_px, wanted)
     seen_light, blur, seen_coc = seen.split([light.shape[1], 1, 1], 1)
@@ -219,15 +218,20 @@ def _surfaces_of_image(
     if not active().filling:
         certain = torch.zeros_like(certain)
 
-    # Up to HIDDEN_WEIGHT / 2 a mixed sample does not count, and the hidden one replaces it. Both weights are 0 at the
-    # limit, where light and coc jump from one to the other.
-    hidden = certain * (-HIDDEN_WEIGHT * mixed.clamp(max=0.0))
-    replaced = torch.where(hidden > 0, 1.0, 0.0)
+    # how far the samples behind the pixel may take the part of its other surface: a small one that is no highlight
+    alike = torch.zeros_like(certain)
     if active().small_shares:
         peak = other.amax(1, keepdim=True) / threshold.clamp_min(torch.finfo(threshold.dtype).tiny)
-        same = (1.0 - is_another_surface((seen_coc - other_coc).abs())) * (2.0 - 2.0 * peak).clamp(0.0, 1.0)
-        replaced = torch.where(hidden > 0, 1.0, sharper * certain * same * (1.0 - 2.0 * other_weight).clamp_min(0.0))
-    other, other_coc = torch.lerp(other, seen_light, replaced), torch.lerp(other_coc, seen_coc, replaced)
+        alike = (2.0 - 2.0 * peak).clamp(0.0, 1.0) * (1.0 - 2.0 * other_weight).clamp_min(0.0)
+        alike = alike * (1.0 - is_another_surface((seen_coc - other_coc).abs()))
+    # Up to HIDDEN_WEIGHT / 2 a mixed sample does not count, and the hidden one replaces it. If the two are not alike,
+    # both weights are 0 at the limit, where light and coc jump from one to the other.
+    missing = (-mixed).clamp_min(0.0)
+    hidden = HIDDEN_WEIGHT * certain * (missing + (1.0 - missing) * alike)
+    sharper = (coc_px.abs() - other_coc.abs()).clamp(0.0, 1.0)
+    kept = (1.0 - sharper * certain * alike) * counted / (hidden + counted).clamp_min(1e-12)
+    kept = torch.where(hidden > 0, kept, 1.0)
+    other, other_coc = torch.lerp(seen_light, other, kept), torch.lerp(seen_coc, other_coc, kept)
     own_weight, other_weight = 1.0 - counted, hidden + counted
     if valid is not None:
         own_weight, other_weight = own_weight * valid, other_weight * valid
