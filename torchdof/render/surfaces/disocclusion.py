@@ -207,6 +207,12 @@ def _surfaces_of_image(
     mixed = other_weight * (2.0 / HIDDEN_WEIGHT) - 1.0
     counted = other_weight * mixed.clamp(0.0, 1.0)
 
+    # how far a hidden sample may take the place of the mixed one: of a small part of the pixel that is no highlight
+    small = torch.zeros_like(mixed)
+    if active().small_shares:
+        peak = other.amax(1, keepdim=True) / threshold.clamp_min(torch.finfo(threshold.dtype).tiny)
+        small = (2.0 - 2.0 * peak).clamp(0.0, 1.0) * (1.0 - 2.0 * other_weight).clamp_min(0.0)
+
     pyramid = _pyramid(matted, coc_px, threshold, valid, levels)
     wanted = (coc_px.abs() > _HIDING_FROM_PX).to(coc_px.dtype)
     behind, searched = _light_behind(pyramid, coc_px, wanted, ops)
@@ -218,20 +224,14 @@ def _surfaces_of_image(
     if not active().filling:
         certain = torch.zeros_like(certain)
 
-    # how far the samples behind the pixel may take the part of its other surface: a small one that is no highlight
-    alike = torch.zeros_like(certain)
-    if active().small_shares:
-        peak = other.amax(1, keepdim=True) / threshold.clamp_min(torch.finfo(threshold.dtype).tiny)
-        alike = (2.0 - 2.0 * peak).clamp(0.0, 1.0) * (1.0 - 2.0 * other_weight).clamp_min(0.0)
-        alike = alike * (1.0 - is_another_surface((seen_coc - other_coc).abs()))
-    # Up to HIDDEN_WEIGHT / 2 a mixed sample does not count, and the hidden one replaces it. If the two are not alike,
-    # both weights are 0 at the limit, where light and coc jump from one to the other.
-    missing = (-mixed).clamp_min(0.0)
-    hidden = HIDDEN_WEIGHT * certain * (missing + (1.0 - missing) * alike)
+    # Up to HIDDEN_WEIGHT / 2 a mixed sample does not count, and the hidden one replaces it. If both are unlike, their
+    # weights are 0 at the limit, where light and coc jump from one to the other.
+    alike = small * (1.0 - is_another_surface((seen_coc - other_coc).abs()))
+    hidden = HIDDEN_WEIGHT * certain * (1.0 - (1.0 - alike) * (1.0 + mixed).clamp(0.0, 1.0))
     sharper = (coc_px.abs() - other_coc.abs()).clamp(0.0, 1.0)
-    kept = (1.0 - sharper * certain * alike) * counted / (hidden + counted).clamp_min(1e-12)
+    kept = (1.0 - sharper * certain * alike) * (counted / (hidden + counted).clamp_min(1e-12))
     kept = torch.where(hidden > 0, kept, 1.0)
-    other, other_coc = torch.lerp(seen_light, other, kept), torch.lerp(seen_coc, other_coc, kept)
+    other, other_coc = (t * kept + u * (1.0 - kept) for t, u in ((other, seen_light), (other_coc, seen_coc)))
     own_weight, other_weight = 1.0 - counted, hidden + counted
     if valid is not None:
         own_weight, other_weight = own_weight * valid, other_weight * valid
