@@ -608,12 +608,12 @@ class Filling {
         filled &= hidden > vec{};
         const vec sharper = clamp01(size - abs(coc)), lent = sharper * certain * alike;
         const vec kept = (1.0f - lent) * counted / max(hidden + counted, broadcast(1e-12f));
-        const auto fill = [&](float *other, vec seen) {
+        const auto put = [&](float *other, vec seen) {
           const vec given = load<vec>(other);
           store(other, filled ? seen + kept * (given - seen) : given);
         };
-        for (int c = 0; c < C; c++) fill(b.other + c * BLOCK_PIXELS + at, mean[c]);
-        fill(b.coc + at, mean[C + 1]);
+        for (int c = 0; c < C; c++) put(b.other + c * BLOCK_PIXELS + at, mean[c]);
+        put(b.coc + at, mean[C + 1]);
         store(b.weight + at, filled ? as_final((hidden + counted) * valid) : mixed);
         store(b.own_weight + at, filled & (own > vec{}) ? 1.0f - counted : own);
       }
