@@ -76,7 +76,7 @@ def test_a_background_has_no_specks_behind_the_edge_of_a_foreground(
     aperture_radius_m: float,
     engine: str,
 ) -> None:
-    """A pixel of the edge shows little of the wall, or hardly anything, so its light tells little of the wall's."""
+    """A pixel of the edge shows little of the wall, or hardly anything: its light measures that of the wall badly."""
 
     def wall(x: Tensor, _: Tensor) -> Tensor:
         return torch.tensor(wall_light, dtype=x.dtype)[:, None, None].expand(3, *x.shape)

@@ -67,8 +67,9 @@ def surfaces_of_image(
        blur: deeper inside, hidden surfaces never show. A slightly farther sample counts as part of the same surface if
        that is strongly blurred, as a slope is not its own background.
     6. Replace second surfaces that are hardly mixed in by the hidden sample.
-    7. A small share of a pixel tells little of the light of a sharper surface: the less it is, the more the hidden
-       sample replaces it, if that lies on the same surface. Highlights stay, which hidden samples do not have.
+    7. The light of a sharper surface is badly measured where its share of the pixel is small. The smaller the share,
+       the more the hidden sample replaces it, if that lies on the same surface. Highlights stay: hidden samples have
+       none.
 
     Args:
         light: ``[B, C, H, W]``.
