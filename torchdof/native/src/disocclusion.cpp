@@ -603,11 +603,11 @@ class Filling {
           const float peak = peak_of(b.other + at + x, BLOCK_PIXELS, C);
           alike[x] *= clamp01(2.0f - 2.0f * (peak / std::max(threshold_at(job_, row, column), TINY)));
         }
-        const vec missing = clamp01(1.0f - mixed * (2.0f / HIDDEN_WEIGHT)), counted = counted_of(mixed);
-        const vec hidden = HIDDEN_WEIGHT * certain * (missing + (1.0f - missing) * alike);
+        const vec counted = counted_of(mixed), part = clamp01(mixed * (2.0f / HIDDEN_WEIGHT));
+        const vec hidden = HIDDEN_WEIGHT * certain * (1.0f - (1.0f - alike) * part);
         filled &= hidden > vec{};
-        const vec sharper = clamp01(size - abs(coc)), lent = sharper * certain * alike;
-        const vec kept = (1.0f - lent) * counted / max(hidden + counted, broadcast(1e-12f));
+        const vec sharper = clamp01(size - abs(coc));
+        const vec kept = (1.0f - sharper * certain * alike) * (counted / max(hidden + counted, broadcast(1e-12f)));
         const auto put = [&](float *other, vec seen) {
           const vec given = load<vec>(other);
           store(other, filled ? seen + kept * (given - seen) : given);

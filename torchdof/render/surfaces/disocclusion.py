@@ -66,7 +66,8 @@ def surfaces_of_image(
        samples behind it, as the foreground's colour must not leak in. The search reaches no farther than the pixel's
        blur: deeper inside, hidden surfaces never show. A slightly farther sample counts as part of the same surface if
        that is strongly blurred, as a slope is not its own background.
-    6. Replace second surfaces that are hardly mixed in by the hidden sample.
+    6. Replace second surfaces that are hardly mixed in by the hidden sample. Beside a larger share of the same surface
+       it keeps its weight, so that no share leaves the pixel without a background.
     7. The light of a sharper surface is badly measured where its share of the pixel is small. The smaller the share,
        the more the hidden sample replaces it, if that lies on the same surface. Highlights stay: hidden samples have
        none.
@@ -232,7 +233,8 @@ def _surfaces_of_image(
     sharper = (coc_px.abs() - other_coc.abs()).clamp(0.0, 1.0)
     kept = (1.0 - sharper * certain * alike) * (counted / (hidden + counted).clamp_min(1e-12))
     kept = torch.where(hidden > 0, kept, 1.0)
-    other, other_coc = (t * kept + u * (1.0 - kept) for t, u in ((other, seen_light), (other_coc, seen_coc)))
+    taken = 1.0 - kept
+    other, other_coc = other * kept + seen_light * taken, other_coc * kept + seen_coc * taken
     own_weight, other_weight = 1.0 - counted, hidden + counted
     if valid is not None:
         own_weight, other_weight = own_weight * valid, other_weight * valid
