@@ -101,6 +101,21 @@ def test_narrow_ramps_of_averaged_depth_are_repaired(scene: Scene, engine: str) 
     assert between[1] < 0.3 * between[0]
 
 
+@pytest.mark.parametrize("degrees", [0.0, 7.0, 23.0, 45.0, 68.0, 90.0])
+@pytest.mark.parametrize("rounding", [0.0, 1.0])
+def test_an_antialiased_map_is_soft_at_any_angle(degrees: float, rounding: float, engine: str) -> None:
+    """A pixel's value is the mean over its area: of one pixel at each edge, at any level between both surfaces."""
+    y, x = torch.meshgrid(*(torch.arange(8.0 * n) / 8 for n in (96, 128)), indexing="ij")
+    angle = math.radians(degrees)
+    across, along = (x - 61.3) * math.cos(angle) + (y - 50.7) * math.sin(angle), y * math.cos(angle) - x * math.sin(angle)
+    waved = (across + 1.7 * torch.sin(along / 9.0)) % 53 < 26
+    is_near = functional.avg_pool2d(waved.float()[None, None], 8)
+    image = torch.tensor([0.1, 0.2, 0.3])[:, None, None] + is_near * torch.tensor([0.5, 0.3, 0.0])[:, None, None]
+    repaired = edges.mended(image, 5 - 11 * (255 * is_near).lerp((255 * is_near).round(), rounding) / 255, "auto")
+    is_mixed = (is_near > 0.1) & (is_near < 0.9)
+    assert ((repaired - 5).abs().minimum((repaired + 6).abs())[is_mixed] < 0.05).float().mean() > 0.9
+
+
 def test_edges_of_a_soft_map_have_no_teeth(engine: str) -> None:
     """Single pixels whose colour is undecided have their neighbours' surface; one with the near colour stays near."""
     image = two_colours()

@@ -101,24 +101,21 @@ class Repair : Planes, EdgeMap {
     return given_kind >= KINDS ? 1.0f - shares_[given_kind - KINDS] : shares_[given_kind];
   }
 
-  // Whether the sampled steps are ramps that are wide, or whose values are often far from both surfaces.
+  // Whether pixels of the sampled edges are often far from both surfaces, by _mixture of render/surfaces/edges.py.
   bool is_on_ramps(const std::vector<Group> &sampled) const {
-    double edges = 0, ramps = 0, mixed = 0, length = 0;
-    for (const Group &group : sampled)
-      for (const Edge &edge : group.edges) {
-        const bool is_ramp = marks_[edge.i] & RAMP;
-        edges++;
-        ramps += is_ramp;
-        mixed += is_ramp && is_mixed((nearness(edge.i) - edge.far) / std::max(edge.near - edge.far, 1e-12f));
-      }
-    if (!(ramps > SOFT * edges)) return false;
+    double mixed = 0, length = 0;
     for (const Group &group : sampled)
       each_edge(group, [&](size_t, const Edge &edge, int y, int x) {
-        const float *value = map_.nearness + edge.i;
+        const float *value = map_.nearness + edge.i, gap = std::max(edge.near - edge.far, 1e-12f);
+        if (marks_[edge.i] & RAMP) {
+          const float level = std::clamp((nearness(edge.i) - edge.far) / gap, 0.0f, 1.0f),
+                      mixture = 4.0f * level * (1.0f - level);
+          mixed += mixture * mixture * mixture;
+        }
         length += climb(value, x > 0 ? -1 : 0, x < width_ - 1 ? 1 : 0, y > 0 ? -width_ : 0,
-                        y < height_ - 1 ? width_ : 0, std::max(edge.near - edge.far, 1e-12f));
+                        y < height_ - 1 ? width_ : 0, gap);
       });
-    return ramps > WIDE * length || mixed > MIXED * ramps;
+    return mixed > SOFT * length;
   }
 
   // Whether more of the sampled step pixels are wrong than in an exact map.

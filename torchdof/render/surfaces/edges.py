@@ -67,12 +67,10 @@ _LEAN = 2.0  # log-odds by which a far surface must win: foreground left behind 
 _TO_BLURRED = 3.0  # log-odds for a soft map's near surface that is more blurred; larger: fewer specks, less detail
 _BESIDE, _DIAGONAL = 1.3, 0.8  # log-odds of a neighbour's surface in soft maps; larger: smoother edges, less detail
 
-# Soft maps: blurred by resampling, or written by a network. More than _SOFT of the edge pixels of a soft map lie on
-# ramps. These are wider than _WIDE, or have more than _MIXED of their pixels in the middle half between both surfaces:
-# compression makes narrow ramps too, whose pixels lie close to one of the surfaces.
-_SOFT = 0.1  # share of edge pixels
-_WIDE = 1.5  # px
-_MIXED = 0.5  # share of a ramp's pixels
+# Soft maps: blurred by resampling, antialiased, or written by a network. Where an edge crosses a row of pixels, values
+# are means over some width in pixels, and about half of that width is far from both surfaces. The artefacts of
+# compression are ramps too, whose pixels lie close to one of the surfaces.
+_SOFT = 0.32  # pixels on ramps, weighed by their :func:`_mixture`, per pixel of edge: with means over pixels 0.35 to 0.5
 
 # With a matte
 _MATTE_REACH = 30  # px; distance from its edge up to which foregrounds neither grow nor blur their surroundings
@@ -312,10 +310,10 @@ def _errors_of(scene: _Map, auto: bool, ops: Ops) -> _Errors:
     edges, dtype, sampled = scene.edges, scene.nearness.dtype, scene.sample()
 
     # whether the map is soft
-    maps = [edges.level, edges.climb, edges.is_ramp, scene.is_mixed, edges.ring]
-    level, climb, is_ramp, mixed, ring = pixels.pick(torch.cat([t.to(dtype) for t in maps], 1), sampled)
-    ramps, mixed, length, steps = scene.sums(sampled, is_ramp, is_ramp * mixed, climb, 1.0 - is_ramp)
-    is_soft = (ramps > _SOFT * (ramps + steps)) & ((ramps > _WIDE * length) | (mixed > _MIXED * ramps))
+    maps = [edges.level, edges.climb, edges.is_ramp, edges.ring]
+    level, climb, is_ramp, ring = pixels.pick(torch.cat([t.to(dtype) for t in maps], 1), sampled)
+    mixed, length, steps = scene.sums(sampled, is_ramp * _mixture(level), climb, 1.0 - is_ramp)
+    is_soft = mixed > _SOFT * length
     sharpness = torch.where(is_soft, SOFT_SHARPNESS, SHARPNESS).flatten().to(dtype)
 
     kind = edge_search.kinds(edges)
@@ -376,6 +374,11 @@ def _moved(scene: _Map, errors: _Errors, shown: Shown, shows_near: Tensor, chose
         evidence = torch.ones_like(evidence)
     moved = torch.where(is_ramp, evidence, (shows_near != was_near).to(own.dtype))
     return pixels.put(scene.nearness, chosen, torch.lerp(own, torch.where(shows_near, shown.near, shown.far), moved))
+
+
+def _mixture(level: Tensor) -> Tensor:
+    """How far levels from 0 to 1 are from both ends, 1 in the middle. Its mean over an edge hardly depends on angles."""
+    return (4.0 * level * (1.0 - level)) ** 3
 
 
 @kept
