@@ -123,7 +123,7 @@ def test_gradient_descent_finds_the_blur_and_with_a_known_lens_the_metres(
     example: dict[str, Any] = runpy.run_path(str(EXAMPLES / "solve_scale.py"))
     main = example["main"]
     *coarse, (factor, steps, rate) = example["STAGES"]
-    monkeypatch.setitem(main.__globals__, "STAGES", (*coarse, (factor, 4, rate)))
+    monkeypatch.setitem(main.__globals__, "STAGES", (*coarse, (factor, 8, rate)))
     scene = ROOT / "tests" / "data" / "scenes" / "room"
     monkeypatch.setattr(
         "sys.argv", ["solve_scale.py", "--scene", str(scene), "--out", str(tmp_path), "--known", "f_number", "focus_m"]

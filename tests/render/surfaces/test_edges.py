@@ -107,7 +107,8 @@ def test_an_antialiased_map_is_soft_at_any_angle(degrees: float, rounding: float
     """A pixel's value is the mean over its area: of one pixel at each edge, at any level between both surfaces."""
     y, x = torch.meshgrid(*(torch.arange(8.0 * n) / 8 for n in (96, 128)), indexing="ij")
     angle = math.radians(degrees)
-    across, along = (x - 61.3) * math.cos(angle) + (y - 50.7) * math.sin(angle), y * math.cos(angle) - x * math.sin(angle)
+    across = (x - 61.3) * math.cos(angle) + (y - 50.7) * math.sin(angle)
+    along = y * math.cos(angle) - x * math.sin(angle)
     waved = (across + 1.7 * torch.sin(along / 9.0)) % 53 < 26
     is_near = functional.avg_pool2d(waved.float()[None, None], 8)
     image = torch.tensor([0.1, 0.2, 0.3])[:, None, None] + is_near * torch.tensor([0.5, 0.3, 0.0])[:, None, None]
