@@ -70,7 +70,7 @@ _BESIDE, _DIAGONAL = 1.3, 0.8  # log-odds of a neighbour's surface in soft maps;
 # Soft maps: blurred by resampling, antialiased, or written by a network. Where an edge crosses a row of pixels, values
 # are means over some width in pixels, and about half of that width is far from both surfaces. The artefacts of
 # compression are ramps too, whose pixels lie close to one of the surfaces.
-_SOFT = 0.32  # mean of :func:`_mixture` on ramps, per pixel of edge; with means over each pixel it is 0.35 to 0.5
+_SOFT = 0.32  # sum of :func:`_mixture` on ramps, per pixel of edge; with means over each pixel it is 0.35 to 0.5
 
 # With a matte
 _MATTE_REACH = 30  # px; distance from its edge up to which foregrounds neither grow nor blur their surroundings
@@ -377,7 +377,7 @@ def _moved(scene: _Map, errors: _Errors, shown: Shown, shows_near: Tensor, chose
 
 
 def _mixture(level: Tensor) -> Tensor:
-    """How far levels from 0 to 1 are from both ends, 1 in the middle. Its mean depends little on the edge's angle."""
+    """How far levels from 0 to 1 are from both ends, 1 in the middle. Its sum depends little on the edge's angle."""
     return (4.0 * level * (1.0 - level)) ** 3
 
 
