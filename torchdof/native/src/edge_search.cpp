@@ -264,7 +264,7 @@ class Search : EdgeMap {
 
   // Adds an edge pixel to the statistics.
   static void measure(EdgeSums &found, float level, bool is_near, float climbed) {
-    const bool is_middle = is_mixed(level);
+    const bool is_middle = std::fabs(level - 0.5f) < 0.25f;
     found.length += climbed;
     found.climbed += is_middle ? climbed : 0.0f;
     found.middles += is_middle;

@@ -17,9 +17,6 @@ float noise_of(const torchdof_map &map);
 EdgeSums find_edges(const EdgeMap &map, std::vector<Group> &groups, int halo, bool expects_ramps, bool measures,
                     const KindMask &selected);
 
-// Whether a level on a step, 0 (far) to 1 (near), is in the middle half.
-inline bool is_mixed(float level) { return std::fabs(level - 0.5f) < 0.25f; }
-
 // Gradient at a pixel as a fraction of the step `gap`, given the offsets of its neighbours. The sum over a step's
 // pixels is its length in pixels.
 float climb(const float *value, int left, int right, int above, int below, float gap);

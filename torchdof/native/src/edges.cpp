@@ -101,19 +101,19 @@ class Repair : Planes, EdgeMap {
     return given_kind >= KINDS ? 1.0f - shares_[given_kind - KINDS] : shares_[given_kind];
   }
 
+  static float gap_of(const Edge &edge) { return std::max(edge.near - edge.far, 1e-12f); }
+  // Place of an edge pixel between its two surfaces, 0 (far) to 1 (near).
+  float level_of(const Edge &edge) const { return clamp01((nearness(edge.i) - edge.far) / gap_of(edge)); }
+
   // Whether pixels of the sampled edges are often far from both surfaces, by _mixture of render/surfaces/edges.py.
   bool is_on_ramps(const std::vector<Group> &sampled) const {
     double mixed = 0, length = 0;
     for (const Group &group : sampled)
       each_edge(group, [&](size_t, const Edge &edge, int y, int x) {
-        const float *value = map_.nearness + edge.i, gap = std::max(edge.near - edge.far, 1e-12f);
-        if (marks_[edge.i] & RAMP) {
-          const float level = std::clamp((nearness(edge.i) - edge.far) / gap, 0.0f, 1.0f),
-                      mixture = 4.0f * level * (1.0f - level);
-          mixed += mixture * mixture * mixture;
-        }
+        const float *value = map_.nearness + edge.i, level = level_of(edge), mixture = 4.0f * level * (1.0f - level);
+        if (marks_[edge.i] & RAMP) mixed += mixture * mixture * mixture;
         length += climb(value, x > 0 ? -1 : 0, x < width_ - 1 ? 1 : 0, y > 0 ? -width_ : 0,
-                        y < height_ - 1 ? width_ : 0, gap);
+                        y < height_ - 1 ? width_ : 0, gap_of(edge));
       });
     return mixed > SOFT * length;
   }
@@ -185,8 +185,7 @@ class Repair : Planes, EdgeMap {
     for (const Group &group : groups)
       for (size_t k = 0; k < group.edges.size(); k++) {
         const Edge &edge = group.edges[k];
-        const float score = group.judged[k].score,
-                    level = (nearness(edge.i) - edge.far) / std::max(edge.near - edge.far, 1e-12f);
+        const float score = group.judged[k].score, level = level_of(edge);
         if (marks_[edge.i] & RAMP ? std::fabs(level - 0.5f) <= CLEAR_LEVEL
                                   : edge.kind / DIRECTIONS % RINGS != RINGS - 1)
           continue;

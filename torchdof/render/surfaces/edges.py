@@ -223,7 +223,6 @@ class _Map(NamedTuple):
     step: Tensor  # smallest difference in nearness of two surfaces
     edges: Edges
     is_near: Tensor  # whether the map gives a pixel the near one of the two surfaces around it
-    is_mixed: Tensor  # whether a pixel at an edge is in the middle half between both
     looks: Looks
     of_coc: bool
 
@@ -235,9 +234,8 @@ class _Map(NamedTuple):
         step = torch.maximum(step, _NOISES * edge_search.noise(given, valid))
         edges = find_edges(light, given, valid, step)
         is_near = 2.0 * given > edges.near + edges.far
-        is_mixed = edges.is_edge & ((edges.level - 0.5).abs() < 0.25)
         looks = Looks.of(light, given, valid, edges)
-        return cls(light, given, valid, step, edges, is_near, is_mixed, looks, of_coc)
+        return cls(light, given, valid, step, edges, is_near, looks, of_coc)
 
     def item_of(self, chosen: Tensor) -> Tensor:
         """The item of each pixel ``[P]``."""
@@ -299,7 +297,7 @@ def _repair(
         label = pixels.put(scene.is_near.to(repaired.dtype), chosen, shows_near.to(repaired.dtype))
         length = scene.edges.climb.sum((1, 2, 3), keepdim=True).clamp_min(1e-12)
         lost = torch.where(scene.edges.is_edge, label - scene.edges.level, 0.0).sum((1, 2, 3), keepdim=True)
-        soft = Softness(errors.is_soft, sigma_of(scene.edges, scene.is_mixed), lost / length, errors.doubt)
+        soft = Softness(errors.is_soft, sigma_of(scene.edges), lost / length, errors.doubt)
         repaired = lift_lamps(scene.light, scene.nearness, repaired, scene.step, soft, ops)
     repaired = torch.where(scene.valid, repaired, signed)
     return -repaired if of_coc else repaired, errors.doubt

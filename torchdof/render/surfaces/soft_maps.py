@@ -64,10 +64,11 @@ class Softness(NamedTuple):
     doubt: Tensor  # 0 to 1, how much the image contradicts the map
 
 
-def sigma_of(edges: Edges, is_mixed: Tensor) -> Tensor:
-    """Standard deviation of a map's blur in pixels, ``[B, 1, 1, 1]``; ``is_mixed``: in the middle half of steps."""
-    climbed = (edges.climb * is_mixed).sum((1, 2, 3), keepdim=True).clamp_min(1e-12)
-    ramp_px = _CLIMBED * is_mixed.sum((1, 2, 3), keepdim=True) / climbed
+def sigma_of(edges: Edges) -> Tensor:
+    """Standard deviation of a map's blur in pixels, ``[B, 1, 1, 1]``."""
+    is_middle = edges.is_edge & ((edges.level - 0.5).abs() < 0.25)
+    climbed = (edges.climb * is_middle).sum((1, 2, 3), keepdim=True).clamp_min(1e-12)
+    ramp_px = _CLIMBED * is_middle.sum((1, 2, 3), keepdim=True) / climbed
     return (ramp_px.square() - _PIXEL).clamp_min(0.0).sqrt().clamp(_LEAST_BLUR_PX, _MOST_BLUR_PX)
 
 
