@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from torch import Tensor
+from torch.nn import functional
 from torch.testing import assert_close
 
 from tests.scenes import furry_post, wavy_post
@@ -66,6 +67,18 @@ def test_a_map_that_misses_parts_is_in_doubt(engine: str) -> None:
     with without(["in_doubt"]):
         before = mended(image, given)
     assert int((coc.abs() > before.abs() + 1.0).sum()) > 1000
+
+
+def test_a_map_with_ramps_of_a_pixel_is_less_in_doubt(engine: str) -> None:
+    """Strong compression makes such ramps too, and leaves edges where they were."""
+    y, x = torch.meshgrid(*(torch.arange(8.0 * n) / 8 for n in (96, 128)), indexing="ij")
+    is_near = functional.avg_pool2d(((x + 1.7 * torch.sin(y / 9.0)) % 53 < 26).float()[None, None], 8)
+    shown = torch.where(torch.rand(is_near.shape) < 0.12, 1.0 - is_near.round(), is_near)
+    image = 0.1 + shown * torch.tensor([0.5, 0.3, 0.1])[:, None, None]
+    wider = functional.avg_pool2d(functional.pad(is_near, [1, 1, 1, 1], mode="replicate"), 3, stride=1)
+    doubts = [float(edges.repair(image, 5 - 11 * near, edges.STEP_PX, True, True)[1]) for near in (is_near, wider)]
+    assert 0.0 < doubts[0] < 0.6
+    assert doubts[1] == 1.0
 
 
 def test_each_item_of_a_batch_has_its_own_doubt(engine: str) -> None:

@@ -72,7 +72,8 @@ class Repair : Planes, EdgeMap {
     }
     // blocks and tiles contain edge pixels that are not sampled
     choose_edges(sampled, [&](const Edge &edge) { return is_sampled(edge.i / width_, edge.i % width_); });
-    const bool is_soft = is_on_ramps(sampled);
+    const double softness = softness_of(sampled);
+    const bool is_soft = softness > 1;
     const float sharpness = is_soft ? SOFT_SHARPNESS : SHARPNESS;
     judge_edges(*this, sampled, false, sharpness);
     calibrate(sampled);
@@ -86,7 +87,7 @@ class Repair : Planes, EdgeMap {
     else
       choose_edges(groups, [&](const Edge &edge) { return doubtful[given_kind_of(edge)]; });
     judge_edges(*this, groups, true, sharpness);
-    if (map_.automatic && is_soft) doubt = doubt_of(agreement);
+    if (map_.automatic && is_soft) doubt = doubt_of(agreement) * clamp01((float)softness - 1.0f);
     const float lost_px = move(groups, is_soft, (float)doubt);
     if (is_soft) remove_ringing(*this);
     if (is_soft && doubt < 1) lift_lamps(*this, sigma_of(found_), lost_px, (float)doubt);
@@ -105,8 +106,9 @@ class Repair : Planes, EdgeMap {
   // Place of an edge pixel between its two surfaces, 0 (far) to 1 (near).
   float level_of(const Edge &edge) const { return clamp01((nearness(edge.i) - edge.far) / gap_of(edge)); }
 
-  // Whether pixels of the sampled edges are often far from both surfaces, by _mixture of render/surfaces/edges.py.
-  bool is_on_ramps(const std::vector<Group> &sampled) const {
+  // How often pixels of the sampled edges are far from both surfaces, by _mixture of render/surfaces/edges.py; a map is
+  // soft from 1.
+  double softness_of(const std::vector<Group> &sampled) const {
     double mixed = 0, length = 0;
     for (const Group &group : sampled)
       each_edge(group, [&](size_t, const Edge &edge, int y, int x) {
@@ -115,7 +117,7 @@ class Repair : Planes, EdgeMap {
         length += climb(value, x > 0 ? -1 : 0, x < width_ - 1 ? 1 : 0, y > 0 ? -width_ : 0,
                         y < height_ - 1 ? width_ : 0, gap_of(edge));
       });
-    return mixed > SOFT * length;
+    return mixed / (SOFT * std::max(length, 1e-12));
   }
 
   // Whether more of the sampled step pixels are wrong than in an exact map.

@@ -311,7 +311,8 @@ def _errors_of(scene: _Map, auto: bool, ops: Ops) -> _Errors:
     maps = [edges.level, edges.climb, edges.is_ramp, edges.ring]
     level, climb, is_ramp, ring = pixels.pick(torch.cat([t.to(dtype) for t in maps], 1), sampled)
     mixed, length, steps = scene.sums(sampled, is_ramp * _mixture(level), climb, 1.0 - is_ramp)
-    is_soft = mixed > _SOFT * length
+    softness = mixed / (_SOFT * length.clamp_min(1e-12))
+    is_soft = softness > 1.0
     sharpness = torch.where(is_soft, SOFT_SHARPNESS, SHARPNESS).flatten().to(dtype)
 
     kind = edge_search.kinds(edges)
@@ -335,7 +336,9 @@ def _errors_of(scene: _Map, auto: bool, ops: Ops) -> _Errors:
     is_inexact = is_related & (is_soft | (doubts > _EXACT * steps))
     doubtful = edges.is_edge & is_inexact & torch.where(edges.is_ramp, is_soft, wrong > _DOUBTFUL)
     if active().in_doubt:
-        doubt = torch.where(is_soft, doubt_of(clear, agreed).to(dtype), doubt)
+        # not on ramps of a pixel: they are means over pixels, or artefacts of compression, and there is no ramp to doubt
+        faded = doubt_of(clear, agreed) * (softness - 1.0).clamp(0.0, 1.0)
+        doubt = torch.where(is_soft, faded.to(dtype), doubt)
     return _Errors(is_soft, sharpness, prior, doubtful, doubt)
 
 
