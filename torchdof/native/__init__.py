@@ -41,6 +41,7 @@ _instructions = "avx2" if torch.backends.cpu.get_cpu_capability().startswith("AV
 """Instruction set for which the engine in use is compiled."""
 
 _ENGINES = ("auto", "native", "gpu", "torch")  # values of TORCHDOF_ENGINE
+_STOPPED = 2  # result of a repair of edges that finds too wide ramps
 _SMALL_FRAME = 2**16  # pixels; up to this size the main thread renders itself, which saves 0.1 ms
 _of_thread = threading.local()  # count: threads for calls of this thread; is_off: they use the plain engine
 
@@ -400,15 +401,17 @@ def continued_gradient(gradient: Tensor, maps: Sequence[Tensor], ends: Sequence[
 
 
 def repair_edges(
-    light: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool = False
-) -> tuple[Tensor, float]:
+    light: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool = False, stops_if_wide: bool = False
+) -> tuple[Tensor, float] | None:
     """Repairs the edges of a depth map, as :func:`torchdof.render.surfaces.edges.repair`, for one image.
 
     ``light`` is ``[C, H, W]``, ``nearness`` ``[H, W]``, ``step`` ``[H, W]`` or ``[]``. The results are the map, the
-    input itself if it needs no repair, and how much it is in doubt, 0 to 1.
+    input itself if it needs no repair, and how much it is in doubt, 0 to 1. None for a map with ramps that are too wide
+    to be found, with ``stops_if_wide``.
     """
     steps = (None, float(step)) if step.ndim == 0 else (step, 0.0)
-    return _changed("repair_edges", light, nearness, of_coc, *steps, auto)
+    state, repaired, doubt = _changed("repair_edges", light, nearness, of_coc, *steps, auto, stops_if_wide)
+    return None if state == _STOPPED else (repaired, doubt)
 
 
 def missed_parts(light: Tensor, coc_px: Tensor) -> tuple[Tensor, float]:
@@ -417,7 +420,7 @@ def missed_parts(light: Tensor, coc_px: Tensor) -> tuple[Tensor, float]:
     ``light`` is ``[C, H, W]``, ``coc_px`` ``[H, W]``. The results are the map, the input itself if it stays unchanged,
     and how far it has missed parts, 0 to 1.
     """
-    return _changed("missed_parts", light, coc_px, True, None, 0.0, False)
+    return _changed("missed_parts", light, coc_px, True, None, 0.0, False, False)[1:]
 
 
 def blurred_in_doubt(given: Tensor, repaired: Tensor, doubt: float) -> Tensor:
@@ -427,13 +430,13 @@ def blurred_in_doubt(given: Tensor, repaired: Tensor, doubt: float) -> Tensor:
     return out
 
 
-def _changed(function: str, light: Tensor, map_: Tensor, *options: Any) -> tuple[Tensor, float]:
-    """What a function of ``api.h`` makes of a map, or the map itself if it stays unchanged; and a number."""
+def _changed(function: str, light: Tensor, map_: Tensor, *options: Any) -> tuple[int, Tensor, float]:
+    """Whether a function of ``api.h`` changes a map, what it makes of it, the map itself if unchanged, and a number."""
     out, cancelled, changed, number = _empty(*map_.shape), ctypes.c_int32(0), ctypes.c_int32(0), ctypes.c_double(0.0)
     maps = (*map_.shape, light.shape[0], light, map_, *options)
     scene = _API.structures["map"](*maps, _threads(), ctypes.pointer(cancelled), out)
     _interruptible(lambda: _run(function, scene, changed, number), cancelled, map_.numel())
-    return out if changed.value else map_, number.value
+    return changed.value, out if changed.value else map_, number.value
 
 
 def coc_px(depth: Tensor, scale: float, nearest_m: float, farthest_m: float) -> Tensor:

@@ -40,6 +40,8 @@ struct Planes {
   const Buffer<uint8_t> marks;
 };
 
+enum Result { UNCHANGED, CHANGED, STOPPED };
+
 class Repair : Planes, EdgeMap {
  public:
   explicit Repair(const torchdof_map &map)
@@ -53,8 +55,8 @@ class Repair : Planes, EdgeMap {
   // 3. In automatic mode stop here if the map is exact or its edges are unrelated to the image's.
   // 4. Find and decide the edges of the whole frame; move pixels that have the depth of the wrong surface.
   // 5. In a soft map also remove ringing, and restore the nearness of small lamps that a blur has reduced.
-  // Returns whether the map has changed; doubt: how much the image contradicts a soft map, 0 to 1.
-  bool run(double &doubt) {
+  // Returns whether the map has changed, or that it stopped because of its ramps; doubt: how much the image contradicts a soft map, 0 to 1.
+  Result run(double &doubt) {
     doubt = 0;
     const int every = (int)std::ceil(std::sqrt((double)area_ / SAMPLED));
     // where the sample is a small part of the frame, only its edges are found first
@@ -74,11 +76,12 @@ class Repair : Planes, EdgeMap {
     choose_edges(sampled, [&](const Edge &edge) { return is_sampled(edge.i / width_, edge.i % width_); });
     const double softness = softness_of(sampled);
     const bool is_soft = softness > 1;
+    if (map_.stops_if_wide && softness > WIDE) return STOPPED;
     const float sharpness = is_soft ? SOFT_SHARPNESS : SHARPNESS;
     judge_edges(*this, sampled, false, sharpness);
     calibrate(sampled);
     const Agreement agreement = agreement_of(sampled);
-    if (map_.automatic && (!is_related(agreement) || !(is_soft || is_inexact(sampled)))) return false;
+    if (map_.automatic && (!is_related(agreement) || !(is_soft || is_inexact(sampled)))) return UNCHANGED;
     parallel(height_,
              [&](int y) { memcpy(map_.out + pixel(y, 0), map_.nearness + pixel(y, 0), width_ * sizeof(float)); });
     const KindMask doubtful = map_.automatic ? doubtful_kinds(is_soft) : all_kinds;
@@ -91,7 +94,7 @@ class Repair : Planes, EdgeMap {
     const float lost_px = move(groups, is_soft, (float)doubt);
     if (is_soft) remove_ringing(*this);
     if (is_soft && doubt < 1) lift_lamps(*this, sigma_of(found_), lost_px, (float)doubt);
-    return true;
+    return CHANGED;
   }
 
  private:

@@ -15,6 +15,7 @@ import functools
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as functional
 from torch import Tensor
 
 from ... import native, pixels, validation
@@ -27,6 +28,7 @@ from ..engines.on_gpu import calibrate, find_edges, judge
 from ..engines.ops import EAGER, Ops
 from ..engines.traced import is_compiled, one_operator
 from ..layers.convolution import widest_float
+from ..layers.downsampling import downsampled, upsampled
 from ..rules import active
 from . import edge_search
 from .coverage import is_near_edge
@@ -71,6 +73,8 @@ _BESIDE, _DIAGONAL = 1.3, 0.8  # log-odds of a neighbour's surface in soft maps;
 # are means over some width in pixels, and about half of that width is far from both surfaces. The artefacts of
 # compression are ramps too, whose pixels lie close to one of the surfaces.
 _SOFT = 0.32  # sum of :func:`_mixture` on ramps, per pixel of edge; with means over each pixel it is 0.35 to 0.5
+_WIDE = 13.0  # this sum over _SOFT; maps of a quarter of the resolution have up to 12, of an eighth 15 to 20
+_HALVINGS = 2  # most halvings of a map with wider ramps
 
 # With a matte
 _MATTE_REACH = 30  # px; distance from its edge up to which foregrounds neither grow nor blur their surroundings
@@ -157,11 +161,18 @@ def _has_steps(coc_px: Tensor) -> Tensor:
 
 
 def repair(
-    image: Tensor, nearness: Tensor, step: Tensor | float, auto: bool, of_coc: bool = False, ops: Ops = EAGER
+    image: Tensor,
+    nearness: Tensor,
+    step: Tensor | float,
+    auto: bool,
+    of_coc: bool = False,
+    ops: Ops = EAGER,
+    halvings: int = _HALVINGS,
 ) -> tuple[Tensor, Tensor]:
     """Repairs a map of nearness, of any scale and offset.
 
-    Values that are not finite, or above 1e15 in magnitude, stay unchanged and affect no other pixel.
+    Values that are not finite, or above 1e15 in magnitude, stay unchanged and affect no other pixel. Maps that were
+    enlarged have ramps wider than the window in which edges are found: these maps are repaired at half the size first.
 
     Args:
         image: ``[B, C, H, W]``, linear light.
@@ -171,6 +182,7 @@ def repair(
         of_coc: Whether ``nearness`` is a map of the coc instead, in which a larger value is farther. With
             ``auto``, undecided pixels of a soft map then go to a near surface that is more blurred.
         ops: Processes lists of pixels in parts.
+        halvings: How many times the size of a map with wider ramps may be halved.
 
     Returns:
         ``[B, 1, H, W]``, constant to autograd; unchanged pixels keep their values to the bit. ``nearness`` itself if
@@ -179,23 +191,57 @@ def repair(
     device = image.device.type
     if torch.is_autocast_enabled(device):  # which would compute in half precision
         with torch.autocast(device, enabled=False):
-            return repair(image, nearness, step, auto, of_coc, ops)
+            return repair(image, nearness, step, auto, of_coc, ops, halvings)
     image = image.detach()
     light, given = image.float(), nearness.float().expand(image.shape[0], -1, -1, -1)
     step = torch.as_tensor(step, dtype=given.dtype, device=given.device)
     if is_compiled():
-        repaired, doubt = _operator(light, given, step, auto, of_coc)
+        repaired, doubt = _operator(light, given, step, auto, of_coc, halvings)
     elif engine_reads(light, given):
         steps = step.expand(light.shape[0], 1, *given.shape[-2:]) if step.ndim else step.expand(light.shape[0], 1)
-        repair_item = functools.partial(native.repair_edges, auto=auto, of_coc=of_coc)
+        repair_item = functools.partial(_repair_item, auto=auto, of_coc=of_coc, halvings=halvings)
         repaired, doubt = by_items(repair_item, given, light, steps[:, 0])
         if repaired is given:
             return nearness, doubt
     else:
-        repaired, doubt = _repair(light, given, step, auto, of_coc, ops)
+        repaired, doubt = _repair(light, given, step, auto, of_coc, ops, halvings)
     if nearness.dtype == torch.float32:
         return repaired, doubt
     return torch.where(repaired == given, nearness, repaired.to(nearness.dtype)), doubt
+
+
+def _repair_item(
+    light: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool, halvings: int
+) -> tuple[Tensor, float]:
+    """:func:`repair` by the compiled engine, for one item: ``[C, H, W]``, ``[H, W]``, and ``[H, W]`` or ``[]``."""
+    repaired = native.repair_edges(light, nearness, step, auto, of_coc, stops_if_wide=halvings > 0)
+    if repaired is None:
+        given = light[None], nearness[None, None], step[None, None]
+        narrow = _narrowed(*given, auto, of_coc, EAGER, halvings)[0, 0]
+        repaired = native.repair_edges(light, narrow, step, auto, of_coc, stops_if_wide=False)
+    return repaired
+
+
+def _narrowed(
+    light: Tensor, given: Tensor, step: Tensor, auto: bool, of_coc: bool, ops: Ops, halvings: int
+) -> Tensor:
+    """A map ``[B, 1, H, W]`` plus what the repair changes at half the size: narrower ramps. Invalid values stay."""
+    height, width = given.shape[-2:]
+
+    def halved(values: Tensor) -> Tensor:
+        return downsampled(functional.pad(values, (0, width % 2, 0, height % 2), mode="replicate"), 2)
+
+    valid = given.abs() <= LARGEST
+    share = halved(valid.to(given.dtype))
+    half = torch.where(share > 0, halved(torch.where(valid, given, 0.0)) / share.clamp_min(0.25), torch.nan)
+    if step.ndim == 4:
+        step = halved(step)
+    sign = -1.0 if of_coc else 1.0
+    if of_coc:  # in pixels of the smaller frame; undecided pixels wait for the full size to go to the more blurred side
+        step = 2.0 * step
+    repaired, _ = repair(halved(finite_light(light)), sign * half, step, auto, False, ops, halvings - 1)
+    change = torch.where(share > 0, repaired - sign * half, 0.0)
+    return given + sign * upsampled(change, 2)[..., :height, :width]
 
 
 @torch.no_grad()
@@ -260,6 +306,26 @@ class _Map(NamedTuple):
         return found[..., None, None, None].unbind(0)
 
 
+class _Sample(NamedTuple):
+    """A sample of the frame, from which the errors of its map are learnt: ``[P]`` each, sums are ``[B, 1, 1, 1]``."""
+
+    chosen: Tensor  # indices of edge pixels, those of some blocks
+    level: Tensor
+    is_ramp: Tensor
+    ring: Tensor
+    steps: Tensor  # number of the pixels at steps
+    softness: Tensor  # a map is soft from 1
+
+    @classmethod
+    def of(cls, scene: _Map) -> "_Sample":
+        """From the map whose edges are repaired."""
+        edges, chosen = scene.edges, scene.sample()
+        maps = [edges.level, edges.climb, edges.is_ramp, edges.ring]
+        level, climb, is_ramp, ring = pixels.pick(torch.cat([t.to(edges.level.dtype) for t in maps], 1), chosen)
+        mixed, length, steps = scene.sums(chosen, is_ramp * _mixture(level), climb, 1.0 - is_ramp)
+        return cls(chosen, level, is_ramp, ring, steps, mixed / (_SOFT * length.clamp_min(1e-12)))
+
+
 class _Errors(NamedTuple):
     """The errors of a map, estimated from a sample of the frame."""
 
@@ -272,11 +338,17 @@ class _Errors(NamedTuple):
 
 @torch.no_grad()
 def _repair(
-    image: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool = False, ops: Ops = EAGER
+    image: Tensor,
+    nearness: Tensor,
+    step: Tensor,
+    auto: bool,
+    of_coc: bool = False,
+    ops: Ops = EAGER,
+    halvings: int = _HALVINGS,
 ) -> tuple[Tensor, Tensor]:
     """Plain PyTorch version of :func:`repair`.
 
-    1. Find ramps and steps, and the nearness of both surfaces there.
+    1. Find ramps and steps, and the nearness of both surfaces there; narrow the ramps of a map where they are too wide.
     2. From a sample of the edge pixels, detect soft maps, score the pixels by colour, and fit the prior of each kind of
        edge pixel. Select the pixels to decide: all edge pixels; with ``auto``, those of kinds that are often wrong.
     3. Decide which surface the selected pixels show, and give them its nearness, on ramps in proportion to evidence.
@@ -284,7 +356,15 @@ def _repair(
     """
     signed = -nearness if of_coc else nearness
     scene = _Map.of(image, signed, step, of_coc)
-    errors = _errors_of(scene, auto, ops)
+    sample = _Sample.of(scene)
+    is_wide = sample.softness > _WIDE
+    if halvings and (is_traced() or is_wide.any()):
+        narrow = torch.where(is_wide, _narrowed(image, nearness, step, auto, of_coc, ops, halvings), nearness)
+        nearness = ops.equal_unless(is_wide.any, narrow, nearness)
+        signed = -nearness if of_coc else nearness
+        scene = _Map.of(image, signed, step, of_coc)
+        sample = _Sample.of(scene)
+    errors = _errors_of(scene, sample, auto, ops)
     chosen = pixels.indices(errors.doubtful)
     if auto and is_empty(chosen):  # nor lamps: a soft map has ramps, which are selected
         return nearness, torch.zeros_like(errors.doubt)
@@ -303,15 +383,9 @@ def _repair(
     return -repaired if of_coc else repaired, errors.doubt
 
 
-def _errors_of(scene: _Map, auto: bool, ops: Ops) -> _Errors:
+def _errors_of(scene: _Map, sample: _Sample, auto: bool, ops: Ops) -> _Errors:
     """Step 2 of :func:`_repair`."""
-    edges, dtype, sampled = scene.edges, scene.nearness.dtype, scene.sample()
-
-    # whether the map is soft
-    maps = [edges.level, edges.climb, edges.is_ramp, edges.ring]
-    level, climb, is_ramp, ring = pixels.pick(torch.cat([t.to(dtype) for t in maps], 1), sampled)
-    mixed, length, steps = scene.sums(sampled, is_ramp * _mixture(level), climb, 1.0 - is_ramp)
-    softness = mixed / (_SOFT * length.clamp_min(1e-12))
+    edges, dtype, (sampled, level, is_ramp, ring, steps, softness) = scene.edges, scene.nearness.dtype, sample
     is_soft = softness > 1.0
     sharpness = torch.where(is_soft, SOFT_SHARPNESS, SHARPNESS).flatten().to(dtype)
 
@@ -395,13 +469,17 @@ def _from_border(size: int, device: torch.device) -> Tensor:
     return torch.minimum(places, size - 1 - places)
 
 
-def _empty(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool) -> tuple[Tensor, Tensor]:
+def _empty(
+    image: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool, halvings: int
+) -> tuple[Tensor, Tensor]:
     out = torch.empty_like(nearness, memory_format=torch.contiguous_format)
     return out, nearness.new_empty(nearness.shape[0], 1, 1, 1)
 
 
 # The number of pixels to process depends on the data, which compiled graphs do not support.
 @one_operator("torchdof::repair_edges", _empty)
-def _operator(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool) -> tuple[Tensor, Tensor]:
-    repaired, doubt = _repair(image, nearness, step, auto, of_coc)
+def _operator(
+    image: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool, halvings: int
+) -> tuple[Tensor, Tensor]:
+    repaired, doubt = _repair(image, nearness, step, auto, of_coc, EAGER, halvings)
     return repaired.clone(), doubt
