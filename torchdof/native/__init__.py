@@ -401,16 +401,22 @@ def continued_gradient(gradient: Tensor, maps: Sequence[Tensor], ends: Sequence[
 
 
 def repair_edges(
-    light: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool = False, stops_if_wide: bool = False
+    light: Tensor,
+    nearness: Tensor,
+    step: Tensor,
+    auto: bool,
+    of_coc: bool = False,
+    stops_if_wide: bool = False,
+    is_related: bool = False,
 ) -> tuple[Tensor, float] | None:
     """Repairs the edges of a depth map, as :func:`torchdof.render.surfaces.edges.repair`, for one image.
 
     ``light`` is ``[C, H, W]``, ``nearness`` ``[H, W]``, ``step`` ``[H, W]`` or ``[]``. The results are the map, the
     input itself if it needs no repair, and how much it is in doubt, 0 to 1. None for a map with ramps that are too wide
-    to be found, with ``stops_if_wide``.
+    to be found, with ``stops_if_wide``. ``is_related``: the colours are known to be related to the map.
     """
     steps = (None, float(step)) if step.ndim == 0 else (step, 0.0)
-    state, repaired, doubt = _changed("repair_edges", light, nearness, of_coc, *steps, auto, stops_if_wide)
+    state, repaired, doubt = _changed("repair_edges", light, nearness, of_coc, *steps, auto, stops_if_wide, is_related)
     return None if state == _STOPPED else (repaired, doubt)
 
 
@@ -420,7 +426,7 @@ def missed_parts(light: Tensor, coc_px: Tensor) -> tuple[Tensor, float]:
     ``light`` is ``[C, H, W]``, ``coc_px`` ``[H, W]``. The results are the map, the input itself if it stays unchanged,
     and how far it has missed parts, 0 to 1.
     """
-    return _changed("missed_parts", light, coc_px, True, None, 0.0, False, False)[1:]
+    return _changed("missed_parts", light, coc_px, True, None, 0.0, False, False, False)[1:]
 
 
 def blurred_in_doubt(given: Tensor, repaired: Tensor, doubt: float) -> Tensor:

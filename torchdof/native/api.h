@@ -120,6 +120,7 @@ typedef struct {
   float step;             // the same for all pixels
   int32_t automatic;      // 1: leave a map with exact edges unchanged
   int32_t stops_if_wide;  // 1: leave a map with ramps too wide to be found unchanged, with `changed` = 2
+  int32_t is_related;     // 1: the colours are known to be related to the map
   int32_t threads;
   const volatile int32_t *cancelled;
   float *out;  // [height, width]
@@ -128,7 +129,7 @@ typedef struct {
 // changed: 0 if the map needs no repair, 2 if it stops because of its ramps; out is then not written. doubt: how much the map is in doubt, 0 to 1.
 TORCHDOF_API int32_t torchdof_repair_edges(const torchdof_map *map, int32_t *changed, double *doubt);
 
-// Gives missed fine parts of blurred foregrounds to them, in a map of coc; reads no members from steps to stops_if_wide.
+// Gives missed fine parts of blurred foregrounds to them, in a map of coc; reads no members from steps to is_related.
 // share: how far the map has missed parts, 0 to 1.
 TORCHDOF_API int32_t torchdof_missed_parts(const torchdof_map *map, int32_t *changed, double *share);
 

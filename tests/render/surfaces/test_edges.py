@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from tests.scenes import TURNS
+from tests.scenes import TURNS, made
 from torchdof import Camera, DepthOfField, blur_by_coc, native
 from torchdof.depth import repair_edges
 from torchdof.options import DepthEdges
@@ -437,3 +437,44 @@ def test_repairs_of_all_maps_are_finite(near: float, far: float, light: float, e
     assert float(repaired[known].abs().max()) <= 1.001 * float(nearness[known].abs().max())
     too_large = nearness.abs() > 1e15
     assert torch.equal(repaired[too_large], nearness[too_large])
+
+
+def enlarged(height: int = 193, width: int = 262) -> tuple[Tensor, Tensor, Tensor]:
+    """An image, a map of its coc enlarged from an eighth of its size, and the exact map."""
+    y, x = torch.meshgrid(torch.arange(float(height)), torch.arange(float(width)), indexing="ij")
+    is_near = ((x + 6.0 * torch.sin(y / 21.0)) % 90 < 42).float()[None, None]
+    colours = torch.tensor([[0.1, 0.2, 0.3], [0.6, 0.5, 0.3]]).view(2, 3, 1, 1)
+    image = torch.lerp(colours[0], colours[1], is_near) * (0.9 + 0.2 * torch.rand(1, 3, height, width))
+    small = functional.interpolate(is_near, (height // 8, width // 8), mode="area")
+    return image, 5 - 11 * functional.interpolate(small, (height, width), mode="bilinear"), 5 - 11 * is_near
+
+
+def test_a_map_that_was_enlarged_gets_the_edges_of_the_image(engine: str) -> None:
+    image, given, exact = enlarged()
+    shares = [float(((m - exact).abs() > 1).float().mean()) for m in (given, edges.mended(image, given, "auto"))]
+    assert shares[0] > 0.1
+    assert shares[1] < 0.02
+
+
+def test_an_enlarged_map_is_narrowed_alike_by_both_engines_and_beside_other_items(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    image, given, exact = enlarged(141, 203)
+    given[..., 40:43, 60:64], given[..., 0, 0] = torch.nan, torch.inf
+    images, maps = torch.cat([image, image.flip(1)]), torch.cat([given, exact])
+    results = {}
+    for engine in ("torch", "native") if native.chosen() else ("torch",):
+        monkeypatch.setenv("TORCHDOF_ENGINE", engine)
+        results[engine] = edges.mended(images, maps, "auto")
+        alone = [edges.mended(i[None], m[None], "auto") for i, m in zip(images, maps, strict=True)]
+        torch.testing.assert_close(results[engine], torch.cat(alone), rtol=0, atol=0, equal_nan=True)
+        assert torch.equal(results[engine][1:], exact)
+        assert torch.equal(results[engine].isfinite(), maps.isfinite())
+    for result in results.values():
+        torch.testing.assert_close(result, results["torch"], rtol=0, atol=1e-4, equal_nan=True)
+
+
+def test_a_smooth_map_stays(engine: str) -> None:
+    """However wide its slopes are: the image shows no edges there."""
+    scene = made("smooth", 140, 170, 14.0)
+    assert torch.equal(edges.mended(scene.image, scene.coc_px, "auto"), scene.coc_px)

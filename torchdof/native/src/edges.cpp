@@ -55,7 +55,8 @@ class Repair : Planes, EdgeMap {
   // 3. In automatic mode stop here if the map is exact or its edges are unrelated to the image's.
   // 4. Find and decide the edges of the whole frame; move pixels that have the depth of the wrong surface.
   // 5. In a soft map also remove ringing, and restore the nearness of small lamps that a blur has reduced.
-  // Returns whether the map has changed, or that it stopped because of its ramps; doubt: how much the image contradicts a soft map, 0 to 1.
+  // Returns whether the map has changed, or that it stopped because of its ramps; doubt: how much the image contradicts
+  // a soft map, 0 to 1.
   Result run(double &doubt) {
     doubt = 0;
     const int every = (int)std::ceil(std::sqrt((double)area_ / SAMPLED));
@@ -81,7 +82,8 @@ class Repair : Planes, EdgeMap {
     judge_edges(*this, sampled, false, sharpness);
     calibrate(sampled);
     const Agreement agreement = agreement_of(sampled);
-    if (map_.automatic && (!is_related(agreement) || !(is_soft || is_inexact(sampled)))) return UNCHANGED;
+    if (map_.automatic && (!(map_.is_related || is_related(agreement)) || !(is_soft || is_inexact(sampled))))
+      return UNCHANGED;
     parallel(height_,
              [&](int y) { memcpy(map_.out + pixel(y, 0), map_.nearness + pixel(y, 0), width_ * sizeof(float)); });
     const KindMask doubtful = map_.automatic ? doubtful_kinds(is_soft) : all_kinds;

@@ -217,15 +217,18 @@ def _repair_item(
     repaired = native.repair_edges(light, nearness, step, auto, of_coc, stops_if_wide=halvings > 0)
     if repaired is None:
         given = light[None], nearness[None, None], step[None, None]
-        narrow = _narrowed(*given, auto, of_coc, EAGER, halvings)[0, 0]
-        repaired = native.repair_edges(light, narrow, step, auto, of_coc, stops_if_wide=False)
+        narrow, is_related = _narrowed(*given, auto, of_coc, halvings)
+        repaired = native.repair_edges(light, narrow[0, 0], step, auto, of_coc, is_related=bool(is_related))
     return repaired
 
 
 def _narrowed(
-    light: Tensor, given: Tensor, step: Tensor, auto: bool, of_coc: bool, ops: Ops, halvings: int
-) -> Tensor:
-    """A map ``[B, 1, H, W]`` plus what the repair changes at half the size: narrower ramps. Invalid values stay."""
+    light: Tensor, given: Tensor, step: Tensor, auto: bool, of_coc: bool, halvings: int
+) -> tuple[Tensor, Tensor]:
+    """A map ``[B, 1, H, W]`` plus what the repair changes at half the size: narrower ramps. Invalid values stay.
+
+    Also whether it changes something, ``[B, 1, 1, 1]``: then the colours are related to the map.
+    """
     height, width = given.shape[-2:]
 
     def halved(values: Tensor) -> Tensor:
@@ -239,9 +242,10 @@ def _narrowed(
     sign = -1.0 if of_coc else 1.0
     if of_coc:  # in pixels of the smaller frame; undecided pixels wait for the full size to go to the more blurred side
         step = 2.0 * step
-    repaired, _ = repair(halved(finite_light(light)), sign * half, step, auto, False, ops, halvings - 1)
+    repaired, _ = repair(halved(finite_light(light)), sign * half, step, auto, halvings=halvings - 1)
     change = torch.where(share > 0, repaired - sign * half, 0.0)
-    return given + sign * upsampled(change, 2)[..., :height, :width]
+    narrow = given + sign * upsampled(change, 2)[..., :height, :width]
+    return narrow, (change != 0).flatten(1).any(1)[:, None, None, None]
 
 
 @torch.no_grad()
@@ -357,14 +361,14 @@ def _repair(
     signed = -nearness if of_coc else nearness
     scene = _Map.of(image, signed, step, of_coc)
     sample = _Sample.of(scene)
-    is_wide = sample.softness > _WIDE
-    if halvings and (is_traced() or is_wide.any()):
-        narrow = torch.where(is_wide, _narrowed(image, nearness, step, auto, of_coc, ops, halvings), nearness)
-        nearness = ops.equal_unless(is_wide.any, narrow, nearness)
+    is_wide, is_related = sample.softness > _WIDE, torch.zeros_like(sample.softness, dtype=torch.bool)
+    if halvings and not is_traced() and is_wide.any():  # in graphs this would double the time of their export
+        narrow, is_changed = _narrowed(image, nearness, step, auto, of_coc, halvings)
+        nearness, is_related = torch.where(is_wide, narrow, nearness), is_wide & is_changed
         signed = -nearness if of_coc else nearness
         scene = _Map.of(image, signed, step, of_coc)
         sample = _Sample.of(scene)
-    errors = _errors_of(scene, sample, auto, ops)
+    errors = _errors_of(scene, sample, auto, is_related, ops)
     chosen = pixels.indices(errors.doubtful)
     if auto and is_empty(chosen):  # nor lamps: a soft map has ramps, which are selected
         return nearness, torch.zeros_like(errors.doubt)
@@ -383,8 +387,8 @@ def _repair(
     return -repaired if of_coc else repaired, errors.doubt
 
 
-def _errors_of(scene: _Map, sample: _Sample, auto: bool, ops: Ops) -> _Errors:
-    """Step 2 of :func:`_repair`."""
+def _errors_of(scene: _Map, sample: _Sample, auto: bool, is_related: Tensor, ops: Ops) -> _Errors:
+    """Step 2 of :func:`_repair`; ``is_related``: items whose colours are known to be related to the map."""
     edges, dtype, (sampled, level, is_ramp, ring, steps, softness) = scene.edges, scene.nearness.dtype, sample
     is_soft = softness > 1.0
     sharpness = torch.where(is_soft, SOFT_SHARPNESS, SHARPNESS).flatten().to(dtype)
@@ -405,7 +409,7 @@ def _errors_of(scene: _Map, sample: _Sample, auto: bool, ops: Ops) -> _Errors:
     doubts, *sides = scene.sums(sampled, (1.0 - is_ramp) * pixels.pick(wrong, sampled)[0], *is_clear, *agrees)
     clear, agreed = torch.stack(sides).chunk(2)
     assumed = 0.5 * PRIOR_COUNT  # pixels, half of which agree
-    is_related = (agreed + 0.5 * assumed > _RELATED * (clear + assumed)).any(0)
+    is_related = is_related | (agreed + 0.5 * assumed > _RELATED * (clear + assumed)).any(0)
     is_soft = is_soft & is_related
     is_inexact = is_related & (is_soft | (doubts > _EXACT * steps))
     doubtful = edges.is_edge & is_inexact & torch.where(edges.is_ramp, is_soft, wrong > _DOUBTFUL)
