@@ -437,7 +437,7 @@ def blurred_in_doubt(given: Tensor, repaired: Tensor, doubt: float) -> Tensor:
 
 
 def _changed(function: str, light: Tensor, map_: Tensor, *options: Any) -> tuple[int, Tensor, float]:
-    """Whether a function of ``api.h`` changes a map, what it makes of it, the map itself if unchanged, and a number."""
+    """The state that a function of ``api.h`` gives, its map, which is the given one if unchanged, and a number."""
     out, cancelled, changed, number = _empty(*map_.shape), ctypes.c_int32(0), ctypes.c_int32(0), ctypes.c_double(0.0)
     maps = (*map_.shape, light.shape[0], light, map_, *options)
     scene = _API.structures["map"](*maps, _threads(), ctypes.pointer(cancelled), out)

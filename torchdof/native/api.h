@@ -126,7 +126,8 @@ typedef struct {
   float *out;  // [height, width]
 } torchdof_map;
 
-// changed: 0 if the map needs no repair, 2 if it stops because of its ramps; out is then not written. doubt: how much the map is in doubt, 0 to 1.
+// changed: 0 if the map needs no repair, 2 if it stops because of its ramps; out is then not written. doubt: how much
+// the map is in doubt, 0 to 1.
 TORCHDOF_API int32_t torchdof_repair_edges(const torchdof_map *map, int32_t *changed, double *doubt);
 
 // Gives missed fine parts of blurred foregrounds to them, in a map of coc; reads no members from steps to is_related.

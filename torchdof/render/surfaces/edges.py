@@ -414,7 +414,7 @@ def _errors_of(scene: _Map, sample: _Sample, auto: bool, is_related: Tensor, ops
     is_inexact = is_related & (is_soft | (doubts > _EXACT * steps))
     doubtful = edges.is_edge & is_inexact & torch.where(edges.is_ramp, is_soft, wrong > _DOUBTFUL)
     if active().in_doubt:
-        # not on ramps of a pixel: they are means over pixels, or artefacts of compression, and there is no ramp to doubt
+        # ramps of a pixel are means over pixels, or artefacts of compression: there is little to doubt
         faded = doubt_of(clear, agreed) * (softness - 1.0).clamp(0.0, 1.0)
         doubt = torch.where(is_soft, faded.to(dtype), doubt)
     return _Errors(is_soft, sharpness, prior, doubtful, doubt)
