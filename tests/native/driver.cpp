@@ -273,13 +273,15 @@ void check_edges(unsigned seed) {
                               seed % 3 ? nullptr : steps.data(),
                               1.0f,
                               int(seed) % 5 == 0,
+                              int(seed) % 7 == 0,
+                              int(seed) % 4 == 0,
                               threads,
                               &never,
                               out.data()};
     int32_t changed = 0;
     double doubt = 0.0;
     if (torchdof_repair_edges(&map, &changed, &doubt) != TORCHDOF_OK) fail("its edges cannot be repaired", int(seed));
-    if (!changed) out = nearness;
+    if (changed != 1) out = nearness;
     if (map.is_coc) {
       const std::vector<float> repaired = out;
       torchdof_map of_repaired = map;

@@ -408,16 +408,16 @@ def repair_edges(
     of_coc: bool = False,
     stops_if_wide: bool = False,
     is_related: bool = False,
-) -> tuple[Tensor, float] | None:
+) -> tuple[Tensor, float, bool]:
     """Repairs the edges of a depth map, as :func:`torchdof.render.surfaces.edges.repair`, for one image.
 
     ``light`` is ``[C, H, W]``, ``nearness`` ``[H, W]``, ``step`` ``[H, W]`` or ``[]``. The results are the map, the
-    input itself if it needs no repair, and how much it is in doubt, 0 to 1. None for a map with ramps that are too wide
-    to be found, with ``stops_if_wide``. ``is_related``: the colours are known to be related to the map.
+    input itself if it needs no repair, how much it is in doubt, 0 to 1, and whether the repair has stopped because of
+    ramps too wide to be found, with ``stops_if_wide``. ``is_related``: the colours are known to be related to the map.
     """
     steps = (None, float(step)) if step.ndim == 0 else (step, 0.0)
     state, repaired, doubt = _changed("repair_edges", light, nearness, of_coc, *steps, auto, stops_if_wide, is_related)
-    return None if state == _STOPPED else (repaired, doubt)
+    return repaired, doubt, state == _STOPPED
 
 
 def missed_parts(light: Tensor, coc_px: Tensor) -> tuple[Tensor, float]:
@@ -442,7 +442,7 @@ def _changed(function: str, light: Tensor, map_: Tensor, *options: Any) -> tuple
     maps = (*map_.shape, light.shape[0], light, map_, *options)
     scene = _API.structures["map"](*maps, _threads(), ctypes.pointer(cancelled), out)
     _interruptible(lambda: _run(function, scene, changed, number), cancelled, map_.numel())
-    return changed.value, out if changed.value else map_, number.value
+    return changed.value, out if changed.value == 1 else map_, number.value
 
 
 def coc_px(depth: Tensor, scale: float, nearest_m: float, farthest_m: float) -> Tensor:

@@ -105,7 +105,7 @@ def test_engines_agree(size: tuple[int, int]) -> None:
     plain = doubt_rule._blurred(given, repaired, torch.full((1, 1, 1, 1), 0.7))
     fast = native.blurred_in_doubt(given[0, 0], repaired[0, 0], 0.7)
     assert_close(fast, plain[0, 0], rtol=0, atol=1e-4)
-    fast, of_fast = native.repair_edges(image[0], given[0, 0], torch.tensor(edges.STEP_PX), True, True)
+    fast, of_fast, _ = native.repair_edges(image[0], given[0, 0], torch.tensor(edges.STEP_PX), True, True)
     assert_close(fast, repaired[0, 0], rtol=0, atol=1e-3)
     assert of_fast == pytest.approx(float(doubt), abs=1e-3)
 

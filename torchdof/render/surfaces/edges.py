@@ -214,12 +214,12 @@ def _repair_item(
     light: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool, halvings: int
 ) -> tuple[Tensor, float]:
     """:func:`repair` by the compiled engine, for one item: ``[C, H, W]``, ``[H, W]``, and ``[H, W]`` or ``[]``."""
-    repaired = native.repair_edges(light, nearness, step, auto, of_coc, stops_if_wide=halvings > 0)
-    if repaired is None:
+    repaired, doubt, is_wide = native.repair_edges(light, nearness, step, auto, of_coc, stops_if_wide=halvings > 0)
+    if is_wide:
         given = light[None], nearness[None, None], step[None, None]
         narrow, is_related = _narrowed(*given, auto, of_coc, halvings)
-        repaired = native.repair_edges(light, narrow[0, 0], step, auto, of_coc, is_related=bool(is_related))
-    return repaired
+        repaired, doubt, _ = native.repair_edges(light, narrow[0, 0], step, auto, of_coc, is_related=bool(is_related))
+    return repaired, doubt
 
 
 def _narrowed(
