@@ -196,7 +196,7 @@ def repair(
     light, given = image.float(), nearness.float().expand(image.shape[0], -1, -1, -1)
     step = torch.as_tensor(step, dtype=given.dtype, device=given.device)
     if is_compiled():
-        repaired, doubt = _operator(light, given, step, auto, of_coc, halvings)
+        repaired, doubt = _operator(light, given, step, auto, of_coc)
     elif engine_reads(light, given):
         steps = step.expand(light.shape[0], 1, *given.shape[-2:]) if step.ndim else step.expand(light.shape[0], 1)
         repair_item = functools.partial(_repair_item, auto=auto, of_coc=of_coc, halvings=halvings)
@@ -473,17 +473,13 @@ def _from_border(size: int, device: torch.device) -> Tensor:
     return torch.minimum(places, size - 1 - places)
 
 
-def _empty(
-    image: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool, halvings: int
-) -> tuple[Tensor, Tensor]:
+def _empty(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool) -> tuple[Tensor, Tensor]:
     out = torch.empty_like(nearness, memory_format=torch.contiguous_format)
     return out, nearness.new_empty(nearness.shape[0], 1, 1, 1)
 
 
 # The number of pixels to process depends on the data, which compiled graphs do not support.
 @one_operator("torchdof::repair_edges", _empty)
-def _operator(
-    image: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool, halvings: int
-) -> tuple[Tensor, Tensor]:
-    repaired, doubt = _repair(image, nearness, step, auto, of_coc, EAGER, halvings)
+def _operator(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool) -> tuple[Tensor, Tensor]:
+    repaired, doubt = _repair(image, nearness, step, auto, of_coc)
     return repaired.clone(), doubt
