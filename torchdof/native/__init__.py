@@ -416,33 +416,36 @@ def repair_edges(
     ramps too wide to be found, with ``stops_if_wide``. ``is_related``: the colours are known to be related to the map.
     """
     steps = (None, float(step)) if step.ndim == 0 else (step, 0.0)
-    state, repaired, doubt = _changed("repair_edges", light, nearness, of_coc, *steps, auto, stops_if_wide, is_related)
-    return repaired, doubt, state == _STOPPED
+    out, changed, doubt = _empty(*nearness.shape), ctypes.c_int32(0), ctypes.c_double(0.0)
+    options = (of_coc, *steps, auto, stops_if_wide, is_related)
+    _of_map("repair_edges", light, nearness, options, out, changed, doubt)
+    return out if changed.value == 1 else nearness, doubt.value, changed.value == _STOPPED
 
 
 def missed_parts(light: Tensor, coc_px: Tensor) -> tuple[Tensor, float]:
     """Completes a map of the coc, as :func:`torchdof.render.surfaces.missed.completed`, for one image.
 
-    ``light`` is ``[C, H, W]``, ``coc_px`` ``[H, W]``. The results are the map, the input itself if it stays unchanged,
-    and how far it has missed parts, 0 to 1.
+    ``light`` is ``[C, H, W]``, ``coc_px`` ``[H, W]``. The results are the map and how unlike the background each pixel
+    is, ``[2, H, W]``, and how far the map has missed parts, 0 to 1.
     """
-    return _changed("missed_parts", light, coc_px, True, None, 0.0, False, False, False)[1:]
+    out, share = _empty(2, *coc_px.shape), ctypes.c_double(0.0)
+    _of_map("missed_parts", light, coc_px, (True, None, 0.0, False, False, False), out, share)
+    return out, share.value
 
 
-def blurred_in_doubt(given: Tensor, repaired: Tensor, doubt: float) -> Tensor:
+def blurred_in_doubt(given: Tensor, repaired: Tensor, unlike: Tensor, doubt: float) -> Tensor:
     """Blurs the edges of a map of the coc ``[H, W]``, as :func:`torchdof.render.surfaces.doubt.blurred_in_doubt`."""
     out = _empty(*repaired.shape)
-    _run("blurred_in_doubt", given, repaired, *repaired.shape, doubt, _threads(), out)
+    _run("blurred_in_doubt", given, repaired, unlike, *repaired.shape, doubt, _threads(), out)
     return out
 
 
-def _changed(function: str, light: Tensor, map_: Tensor, *options: Any) -> tuple[int, Tensor, float]:
-    """The state that a function of ``api.h`` gives, its map, which is the given one if unchanged, and a number."""
-    out, cancelled, changed, number = _empty(*map_.shape), ctypes.c_int32(0), ctypes.c_int32(0), ctypes.c_double(0.0)
+def _of_map(function: str, light: Tensor, map_: Tensor, options: Sequence[Any], out: Tensor, *results: Any) -> None:
+    """Runs a function of ``api.h`` that reads a map and its image."""
+    cancelled = ctypes.c_int32(0)
     maps = (*map_.shape, light.shape[0], light, map_, *options)
     scene = _API.structures["map"](*maps, _threads(), ctypes.pointer(cancelled), out)
-    _interruptible(lambda: _run(function, scene, changed, number), cancelled, map_.numel())
-    return changed.value, out if changed.value == 1 else map_, number.value
+    _interruptible(lambda: _run(function, scene, *results), cancelled, map_.numel())
 
 
 def coc_px(depth: Tensor, scale: float, nearest_m: float, farthest_m: float) -> Tensor:

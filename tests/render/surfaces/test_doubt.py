@@ -12,7 +12,7 @@ from tests.scenes import furry_post, wavy_post
 from torchdof import native
 from torchdof.render.rules import without
 from torchdof.render.surfaces import doubt as doubt_rule
-from torchdof.render.surfaces import edges
+from torchdof.render.surfaces import edges, windows
 from torchdof.render.surfaces.doubt import blurred_in_doubt, doubt_of
 
 COMPILED = pytest.mark.skipif(not native.chosen(), reason="the compiled engine is not built here")
@@ -102,8 +102,9 @@ def test_invalid_values_stay_and_their_kind_affects_nothing(engine: str) -> None
 def test_engines_agree(size: tuple[int, int]) -> None:
     image, given, _ = (torch.cat([t, t], -1)[..., : size[0], : size[1]].contiguous() for t in wavy_post())
     repaired, doubt = edges._repair(image, given, torch.tensor(edges.STEP_PX), True, True)
-    plain = doubt_rule._blurred(given, repaired, torch.full((1, 1, 1, 1), 0.7))
-    fast = native.blurred_in_doubt(given[0, 0], repaired[0, 0], 0.7)
+    unlike = torch.rand(given.shape)
+    plain = doubt_rule._blurred(given, repaired, unlike, torch.full((1, 1, 1, 1), 0.7))
+    fast = native.blurred_in_doubt(given[0, 0], repaired[0, 0], unlike[0, 0], 0.7)
     assert_close(fast, plain[0, 0], rtol=0, atol=1e-4)
     fast, of_fast, _ = native.repair_edges(image[0], given[0, 0], torch.tensor(edges.STEP_PX), True, True)
     assert_close(fast, repaired[0, 0], rtol=0, atol=1e-3)
@@ -114,7 +115,7 @@ def test_full_doubt_blurs_beside_a_foreground_by_a_share_of_its_blur_that_fades(
     given = torch.full((1, 1, 9, 40), 0.1)
     repaired = given.clone()
     repaired[..., :20] = -10.0
-    blurred = blurred_in_doubt(given, repaired, torch.ones(1, 1, 1, 1))[0, 0, 4]
+    blurred = blurred_in_doubt(given, repaired, torch.ones_like(given), torch.ones(1, 1, 1, 1))[0, 0, 4]
     assert_close(blurred[:20], repaired[0, 0, 4, :20])
     expected = torch.tensor([2 * k / 17 * 8.0 for k in range(8, 0, -1)])  # k of 17 columns are those of the foreground
     assert_close(blurred[20:28], expected)
@@ -127,10 +128,39 @@ def test_the_share_that_fades_is_that_of_the_foreground_also_where_what_it_hides
     repaired[..., :20] = -10.0
     given = repaired.clone()
     given[..., 19] = -1.0  # the repair has moved the edge by a pixel
-    blurred = blurred_in_doubt(given, repaired, torch.ones(1, 1, 1, 1))[0, 0]
+    blurred = blurred_in_doubt(given, repaired, torch.ones_like(given), torch.ones(1, 1, 1, 1))[0, 0]
     expected = torch.tensor([2 * k / 17 * 8.0 for k in range(8, 2, -1)]).expand(60, -1)
     assert_close(blurred[:, 20:26], expected)
     assert blurred[:, 28:].equal(repaired[0, 0, :, 28:])
+
+
+def test_detail_that_resembles_the_background_stays_beside_a_foreground_in_doubt(engine: str) -> None:
+    """Of pixels unlike the background there are none, few or many, as the mean of how unlike they are says."""
+    given = torch.full((1, 1, 9, 40), 0.1)
+    repaired = given.clone()
+    repaired[..., :20] = -10.0
+    doubt = torch.ones(1, 1, 1, 1)
+    shares = (0.0, 0.1, 0.2, 0.5, 1.0)
+    blurs = [blurred_in_doubt(given, repaired, torch.full_like(given, share), doubt) for share in shares]
+    none, none_yet, rising, full, most = (blur[0, 0, 4, 20:28] for blur in blurs)
+    assert float(none.max()) <= 1.0 and none_yet.equal(none)
+    assert_close(rising[:6], 0.3 * full[:6])
+    assert most.equal(full)
+
+
+def test_texture_that_continues_the_background_is_blurred_less(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A map whose edges wind about a post is in doubt; beside the post the background's texture is seen."""
+    image, given, exact = wavy_post()
+    texture = 0.5 + 0.5 * torch.rand(image.shape, generator=torch.Generator().manual_seed(1))
+    image = torch.where(exact < 0, image, texture)
+    repaired, doubt = edges.repair(image, given, edges.STEP_PX, True, True)
+    assert float(doubt) == 1.0
+    is_beside = (repaired > 0) & (windows.highest(-exact, 8) > 0)
+    known = mended(image, given)[is_beside].abs().mean()
+    monkeypatch.setattr(edges, "completed", lambda *maps: (maps[1], torch.ones_like(maps[1]), torch.zeros_like(doubt)))
+    unknown = mended(image, given)[is_beside].abs().mean()
+    assert float(unknown) > 3.0
+    assert float(known) < 0.75 * float(unknown)
 
 
 @pytest.mark.parametrize("farther_px", [0.0, 0.6])
@@ -142,7 +172,8 @@ def test_a_small_change_of_a_map_in_doubt_has_a_small_effect(farther_px: float, 
     given = torch.where(is_sharp, 0.1 * given + farther_px, given)
     moved = given - 2.0 * (torch.rand(given.shape, generator=dice) - 0.97).clamp_min(0.0) / 0.03
     nearby = moved + 1e-3 * (torch.rand(moved.shape, generator=dice) - 0.5)
-    blurred, again = (blurred_in_doubt(given, repaired, torch.ones(1, 1, 1, 1)) for repaired in (moved, nearby))
+    everywhere, full = torch.ones_like(given), torch.ones(1, 1, 1, 1)
+    blurred, again = (blurred_in_doubt(given, repaired, everywhere, full) for repaired in (moved, nearby))
     assert float((blurred != moved).float().mean()) > 0.2
     assert float((again.abs() - blurred.abs()).abs().max()) < 0.02
     is_raised = is_sharp & (blurred.abs() > 1.0 + moved.abs())

@@ -25,8 +25,8 @@ constexpr float one_over_square(int reach) { return 1.0f / (float)((2 * reach + 
 
 class Blur : Frame {
  public:
-  Blur(const float *given, const float *repaired, int height, int width, float doubt, float *out)
-      : Frame(height, width), given_(given), repaired_(repaired), doubt_(doubt), out_(out) {}
+  Blur(const float *given, const float *repaired, const float *unlike, int height, int width, float doubt, float *out)
+      : Frame(height, width), given_(given), repaired_(repaired), unlike_(unlike), doubt_(doubt), out_(out) {}
 
   void run(int threads) const {
     memcpy(out_, repaired_, area_ * sizeof(float));
@@ -63,6 +63,10 @@ class Blur : Frame {
     sums<REACH>(is_near, share, rows, part, one_over_square(REACH));
     max_filter<REACH>(moved, is_beside, rows, part);
 
+    const Grid unlike(part.grown(AROUND_PX)), is_foreign(part);
+    fetch(unlike_, unlike, [](float value) { return value; });
+    sums<AROUND_PX>(unlike, is_foreign, rows, part, one_over_square(AROUND_PX));
+
     const Part at_edge = part.grown(AT_EDGE_PX), around = part.grown(EDGE_REACH);
     const Grid farness(around), high(part), low(part), edge(at_edge), fading(part);
     each_vector(around, [&](int y, int x) {
@@ -78,7 +82,8 @@ class Blur : Frame {
     for (int y = part.y0; y < part.bottom(); y++)
       for (int x = part.x0; x < part.right(); x++) {
         const float own = *nearness.at(y, x), nearest = *near.at(y, x);
-        const float is_beyond = *is_beside.at(y, x) * clamp01(nearest - hiding_px(std::fabs(own)) + 0.5f);
+        const float foreign = clamp01(FROM_BACKGROUND * (*is_foreign.at(y, x) - BACKGROUND));
+        const float is_beyond = *is_beside.at(y, x) * clamp01(nearest - hiding_px(std::fabs(own)) + 0.5f) * foreign;
         const float is_step = clamp01(*high.at(y, x) + *low.at(y, x) - LEAST_STEP_PX + 0.5f);
         const float beside = is_beyond * OF_NEAR * nearest * std::min(2.0f * *share.at(y, x), 1.0f);
         const float least = doubt_ * std::max(beside, is_step * LEAST_BLUR_PX * *fading.at(y, x));
@@ -86,7 +91,7 @@ class Blur : Frame {
       }
   }
 
-  const float *given_, *repaired_;
+  const float *given_, *repaired_, *unlike_;
   const float doubt_;
   float *out_;
 };
@@ -94,7 +99,7 @@ class Blur : Frame {
 }  // namespace
 }  // namespace torchdof
 
-int32_t torchdof_blurred_in_doubt(const float *given, const float *repaired, int32_t height, int32_t width, float doubt,
-                                  int32_t threads, float *out) {
-  return torchdof::guarded([&] { torchdof::Blur(given, repaired, height, width, doubt, out).run(threads); });
+int32_t torchdof_blurred_in_doubt(const float *given, const float *repaired, const float *unlike, int32_t height,
+                                  int32_t width, float doubt, int32_t threads, float *out) {
+  return torchdof::guarded([&] { torchdof::Blur(given, repaired, unlike, height, width, doubt, out).run(threads); });
 }

@@ -56,14 +56,16 @@ class Missed : Frame {
         columns_((width_ + CELL - 1) / CELL), cells_((size_t)rows_ * columns_), plane_((size_t)pitch_ * height_),
         ring_(plane_), near_(plane_), coc_(plane_), roots_(channels_ * plane_) {}
 
-  // Returns whether the map has changed; out is written only then. share: how far the map has missed parts, 0 to 1.
-  bool run(double &share) {
-    share = 0;
+  // Returns how far the map has missed parts, 0 to 1.
+  double run() {
+    memcpy(map_.out, map_.nearness, area_ * sizeof(float));
+    std::fill_n(map_.out + area_, area_, 1.0f);
     find_rings();
-    if (tiles_.empty()) return false;
+    if (tiles_.empty()) return 0;
     const std::vector<float> means = described(background(described(background({}))));
-    share = missed(count(means));
-    return grow(means, GROWTH_PX * (float)share);
+    const float share = missed(count(means));
+    grow(means, GROWTH_PX * share);
+    return share;
   }
 
  private:
@@ -248,6 +250,12 @@ class Missed : Frame {
     return off * load<vec>(of.per_variance() + j);
   }
 
+  // How unlike the background pixels are, 0 to 1.
+  vec unlike(size_t at, const Background &of, int j) const {
+    const vec capped = min(deviation(at, of, j) * (1.0f / UNLIKE), broadcast(MOST_UNLIKE)), odds = capped * capped;
+    return odds / (1.0f + odds);
+  }
+
   // Where the background around pixels is one surface, which continues theirs.
   ivec known(size_t at, const Background &of, int j) const {
     const vec coc = load<vec>(&coc_[at]), apart = load<vec>(of.spread() + j) + abs(load<vec>(of.coc() + j) - coc);
@@ -321,25 +329,24 @@ class Missed : Frame {
     std::vector<Counts> of_tiles(across_ * down_);
     each_tile([&](int tile) {
       Background of(channels_);
-      vec unlike[2], all[2];
+      vec found[2], all[2];
       const auto prepare = [&](int y) {
         read(means, tile, y, of);
-        for (int part = 0; part < 2; part++) unlike[part] = all[part] = vec{};
+        for (int part = 0; part < 2; part++) found[part] = all[part] = vec{};
       };
       const auto add = [&](int j, size_t at) {
         const vec ring = load<vec>(&ring_[at]);
-        const vec capped = min(deviation(at, of, j) * (1.0f / UNLIKE), broadcast(MOST_UNLIKE));
-        const vec odds = capped * capped;
+        const vec is_unlike = unlike(at, of, j);
         const ivec compared = known(at, of, j);
         const ivec parts[] = {compared & (ring > 1.0f) & (ring <= (float)RIM), compared & (ring == (float)RINGS)};
         for (int part = 0; part < 2; part++) {
-          unlike[part] += parts[part] ? odds / (1.0f + odds) : vec{};
+          found[part] += parts[part] ? is_unlike : vec{};
           all[part] += parts[part] ? broadcast(1.0f) : vec{};
         }
       };
       const auto end = [&](int) {
         for (int part = 0; part < 2; part++) {
-          of_tiles[tile][part].unlike += reduce_add(unlike[part]);
+          of_tiles[tile][part].unlike += reduce_add(found[part]);
           of_tiles[tile][part].all += reduce_add(all[part]);
         }
       };
@@ -360,11 +367,9 @@ class Missed : Frame {
     return clamp01((share - MISSED) / (MANY_MISSED - MISSED));
   }
 
-  // Step 5: gives the near surface to pixels of rings whose middle is within its growth. Returns whether there are
-  // some.
-  bool grow(const std::vector<float> &means, float everywhere) {
-    memcpy(map_.out, map_.nearness, area_ * sizeof(float));
-    std::vector<uint8_t> has(across_ * down_);
+  // Step 5: gives the near surface to pixels of rings whose middle is within its growth. Stores how unlike the
+  // background pixels are.
+  void grow(const std::vector<float> &means, float everywhere) {
     each_tile([&](int tile) {
       Background of(channels_);
       const auto prepare = [&](int y) {
@@ -374,16 +379,16 @@ class Missed : Frame {
       const auto take = [&](int j, size_t at) {
         const vec smooth = load<vec>(of.is_smooth() + j) * GROWTH_OVER_SMOOTH_PX;
         const vec middle = lookup(MIDDLES_PX, convert(load<vec>(&ring_[at])));
-        const ivec is_taken = known(at, of, j) & (max(smooth, broadcast(everywhere)) > middle);
-        if (!any_of(is_taken)) return;
-        has[tile] = true;
+        const ivec is_known = known(at, of, j), is_taken = is_known & (max(smooth, broadcast(everywhere)) > middle);
+        const vec is_unlike = unlike(at, of, j);
         float *const out = map_.out + pixel((int)(at / pitch_), (int)(at % pitch_));
-        for (int l = 0; l < LANES; l++)
+        for (int l = 0; l < LANES; l++) {
           if (is_taken[l]) out[l] = near_[at + l];
+          if (is_known[l]) out[area_ + l] = is_unlike[l];
+        }
       };
       each_vector(tile, 1, prepare, take, [](int) {});
     });
-    return std::count(has.begin(), has.end(), 1) > 0;
   }
 
   // Index of a pixel in a plane whose rows are padded to whole tiles; index of a cell.
@@ -404,6 +409,6 @@ class Missed : Frame {
 }  // namespace
 }  // namespace torchdof
 
-int32_t torchdof_missed_parts(const torchdof_map *map, int32_t *changed, double *share) {
-  return torchdof::guarded([&] { *changed = torchdof::Missed(*map).run(*share); });
+int32_t torchdof_missed_parts(const torchdof_map *map, double *share) {
+  return torchdof::guarded([&] { *share = torchdof::Missed(*map).run(); });
 }

@@ -144,8 +144,8 @@ def mended(image: Tensor, coc_px: Tensor, edges: DepthEdges, ops: Ops = EAGER, m
     repaired, contradicted = repair(image, given, STEP_PX, auto=edges == "auto", of_coc=True, ops=ops)
     if repaired is given:
         return coc_px
-    grown, missed = completed(image, repaired, given, ops)
-    blurred = blurred_in_doubt(given, grown, torch.maximum(contradicted, missed), ops)
+    grown, unlike, missed = completed(image, repaired, given, ops)
+    blurred = blurred_in_doubt(given, grown, unlike, torch.maximum(contradicted, missed), ops)
     if matte is None:
         repaired = blurred
     else:

@@ -52,7 +52,7 @@ _LARGEST_PX = 1e6  # px; largest valid coc, whose square is exact enough
 _BRIGHTEST = 1e15  # largest light that is compared
 
 
-def completed(image: Tensor, coc_px: Tensor, before: Tensor, ops: Ops = EAGER) -> tuple[Tensor, Tensor]:
+def completed(image: Tensor, coc_px: Tensor, before: Tensor, ops: Ops = EAGER) -> tuple[Tensor, Tensor, Tensor]:
     """Lets blurred foregrounds grow by what the map misses of them.
 
     Maps that the repair of edges has left as they are count as exact, and stay.
@@ -74,28 +74,31 @@ def completed(image: Tensor, coc_px: Tensor, before: Tensor, ops: Ops = EAGER) -
         ops: Skips frames without such edges.
 
     Returns:
-        The map; gradients flow to unchanged pixels. And how far the map has missed parts, 0 (the share of step 4 is at
-        most :data:`_MISSED`) to 1 (:data:`_MANY_MISSED`), ``[B, 1, 1, 1]``: some of them are still beyond its growth.
+        The map; gradients flow to unchanged pixels. How unlike the background each pixel is, 0 to 1, as in step 3, and
+        1 where no background is known, ``[B, 1, H, W]``. And how far the map has missed parts, 0 (the share of step 4
+        is at most :data:`_MISSED`) to 1 (:data:`_MANY_MISSED`), ``[B, 1, 1, 1]``: some are still beyond its growth.
     """
     light = image.detach().float()
     repaired, before = (t.detach().float().expand(image.shape[0], -1, -1, -1) for t in (coc_px, before))
     is_inexact = ((repaired - before).abs() > 0).flatten(1).any(1)
     share = light.new_zeros(image.shape[0], 1, 1, 1)
     if not active().missed_parts or (not is_traced() and not is_inexact.any()):
-        return coc_px, share
+        return coc_px, torch.ones_like(repaired), share
     if is_compiled():
-        near_px, share = _operator(light, repaired, is_inexact)
+        near_px, unlike, share = _operator(light, repaired, is_inexact)
     elif engine_reads(light, repaired):
-        near_px, share = by_items(
-            lambda *item: native.missed_parts(*item[:2]) if item[2] else (item[1], 0.0), repaired, light, is_inexact
+        maps, share = by_items(
+            lambda *item: native.missed_parts(*item[:2]) if item[2] else (item[1].expand(2, -1, -1), 0.0),
+            *(repaired, light, is_inexact),
         )
+        near_px, unlike = maps[:, 0].split(1, 1)
     else:
-        near_px, share = _completed(light, repaired, is_inexact, ops)
-    return torch.where(near_px == repaired, coc_px, near_px.to(coc_px.dtype)), share
+        near_px, unlike, share = _completed(light, repaired, is_inexact, ops)
+    return torch.where(near_px == repaired, coc_px, near_px.to(coc_px.dtype)), unlike, share
 
 
 @torch.no_grad()
-def _completed(image: Tensor, coc_px: Tensor, is_inexact: Tensor, ops: Ops) -> tuple[Tensor, Tensor]:
+def _completed(image: Tensor, coc_px: Tensor, is_inexact: Tensor, ops: Ops) -> tuple[Tensor, Tensor, Tensor]:
     """:func:`completed` by PyTorch, for float32."""
     is_valid = (coc_px.abs() <= _LARGEST_PX) & is_inexact[:, None, None, None]
     coc, hiding = torch.where(is_valid, coc_px, 0.0), torch.where(is_valid, hiding_px(coc_px.abs()), _FAR_PX)
@@ -109,7 +112,7 @@ def _completed(image: Tensor, coc_px: Tensor, is_inexact: Tensor, ops: Ops) -> t
         values = near
     has_edges = ring.any()
     if not is_traced() and not has_edges:
-        return coc_px, coc.new_zeros(coc.shape[0], 1, 1, 1)
+        return coc_px, torch.ones_like(coc), coc.new_zeros(coc.shape[0], 1, 1, 1)
 
     light = finite_light(image, _BRIGHTEST).sqrt()
     is_sampled = (torch.arange(coc.shape[-2], device=coc.device) % _SAMPLED == 0)[:, None]
@@ -120,9 +123,10 @@ def _completed(image: Tensor, coc_px: Tensor, is_inexact: Tensor, ops: Ops) -> t
     is_one = spread.sqrt() + (middle - on_surface).abs() < _ON_SURFACE * (on_surface + near)
     known = (ring > 0) & (seen > _LEAST_SAMPLES) & is_one
     odds = (deviation / _UNLIKE).clamp(max=_MOST_UNLIKE).square()
+    unlike = torch.where(known, odds / (1.0 + odds), 1.0)
     compared = known & is_sampled
     parts = (compared & (ring > 1) & (ring <= _RIM), compared & (ring == len(_RINGS_PX)))
-    sums = [torch.cat([part * odds / (1.0 + odds), part], 1).sum((2, 3), keepdim=True).split(1, 1) for part in parts]
+    sums = [torch.cat([part * unlike, part], 1).sum((2, 3), keepdim=True).split(1, 1) for part in parts]
     (found, count), (usual, of_usual) = sums
     usual = usual / of_usual.clamp_min(1.0)
     excess = (found / count.clamp_min(1.0) - usual) / (1.0 - usual).clamp_min(_LEAST_LIKE) * count / (count + _COUNTED)
@@ -130,7 +134,7 @@ def _completed(image: Tensor, coc_px: Tensor, is_inexact: Tensor, ops: Ops) -> t
     growth = _GROWTH_PX * share
     growth = torch.where(is_smooth > 0, growth.clamp_min(_GROWTH_OVER_SMOOTH_PX), growth)
     is_taken = known & (growth > _middles_px(coc.dtype, coc.device)[ring.long()])
-    return ops.equal_unless(lambda: has_edges, torch.where(is_taken, -near, coc_px), coc_px), share
+    return ops.equal_unless(lambda: has_edges, torch.where(is_taken, -near, coc_px), coc_px), unlike, share
 
 
 @kept
@@ -140,15 +144,15 @@ def _middles_px(dtype: torch.dtype, device: torch.device) -> Tensor:
     return torch.tensor([0.0, *middles], dtype=dtype, device=device)
 
 
-def _empty(image: Tensor, coc_px: Tensor, is_inexact: Tensor) -> tuple[Tensor, Tensor]:
-    return coc_px.new_empty(coc_px.shape), coc_px.new_empty(coc_px.shape[0], 1, 1, 1)
+def _empty(image: Tensor, coc_px: Tensor, is_inexact: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    return coc_px.new_empty(coc_px.shape), coc_px.new_empty(coc_px.shape), coc_px.new_empty(coc_px.shape[0], 1, 1, 1)
 
 
 # Compiled graphs do not support steps that depend on the data.
 @one_operator("torchdof::missed_parts", _empty)
-def _operator(image: Tensor, coc_px: Tensor, is_inexact: Tensor) -> tuple[Tensor, Tensor]:
-    near_px, share = _completed(image, coc_px, is_inexact, EAGER)
-    return near_px.clone(memory_format=torch.contiguous_format), share
+def _operator(image: Tensor, coc_px: Tensor, is_inexact: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    near_px, unlike, share = _completed(image, coc_px, is_inexact, EAGER)
+    return near_px.clone(memory_format=torch.contiguous_format), unlike, share
 
 
 def _compared(light: Tensor, coc: Tensor, weight: Tensor) -> tuple[Tensor, ...]:
