@@ -135,7 +135,7 @@ def test_the_share_that_fades_is_that_of_the_foreground_also_where_what_it_hides
 
 
 def test_detail_that_resembles_the_background_stays_beside_a_foreground_in_doubt(engine: str) -> None:
-    """Of pixels unlike the background there are none, few or many, as the mean of how unlike they are says."""
+    """Blur rises with the share of pixels that are unlike the background."""
     given = torch.full((1, 1, 9, 40), 0.1)
     repaired = given.clone()
     repaired[..., :20] = -10.0

@@ -87,14 +87,18 @@ def completed(image: Tensor, coc_px: Tensor, before: Tensor, ops: Ops = EAGER) -
     if is_compiled():
         near_px, unlike, share = _operator(light, repaired, is_inexact)
     elif engine_reads(light, repaired):
-        maps, share = by_items(
-            lambda *item: native.missed_parts(*item[:2]) if item[2] else (item[1].expand(2, -1, -1), 0.0),
-            *(repaired, light, is_inexact),
-        )
+        maps, share = by_items(_completed_item, repaired, light, is_inexact)
         near_px, unlike = maps[:, 0].split(1, 1)
     else:
         near_px, unlike, share = _completed(light, repaired, is_inexact, ops)
     return torch.where(near_px == repaired, coc_px, near_px.to(coc_px.dtype)), unlike, share
+
+
+def _completed_item(light: Tensor, coc_px: Tensor, is_inexact: Tensor) -> tuple[Tensor, float]:
+    """The map and how unlike the background its pixels are, ``[2, H, W]``, and the share, of one item."""
+    if is_inexact:
+        return native.missed_parts(light, coc_px)
+    return torch.stack([coc_px, torch.ones_like(coc_px)]), 0.0
 
 
 @torch.no_grad()
