@@ -63,9 +63,9 @@ class Blur : Frame {
     sums<REACH>(is_near, share, rows, part, one_over_square(REACH));
     max_filter<REACH>(moved, is_beside, rows, part);
 
-    const Grid unlike(part.grown(AROUND_PX)), is_foreign(part);
+    const Grid unlike(part.grown(AROUND_PX)), unlike_around(part);
     fetch(unlike_, unlike, [](float value) { return value; });
-    sums<AROUND_PX>(unlike, is_foreign, rows, part, one_over_square(AROUND_PX));
+    sums<AROUND_PX>(unlike, unlike_around, rows, part, one_over_square(AROUND_PX));
 
     const Part at_edge = part.grown(AT_EDGE_PX), around = part.grown(EDGE_REACH);
     const Grid farness(around), high(part), low(part), edge(at_edge), fading(part);
@@ -82,10 +82,10 @@ class Blur : Frame {
     for (int y = part.y0; y < part.bottom(); y++)
       for (int x = part.x0; x < part.right(); x++) {
         const float own = *nearness.at(y, x), nearest = *near.at(y, x);
-        const float foreign = clamp01(FROM_BACKGROUND * (*is_foreign.at(y, x) - BACKGROUND));
-        const float is_beyond = *is_beside.at(y, x) * clamp01(nearest - hiding_px(std::fabs(own)) + 0.5f) * foreign;
+        const float is_beyond = *is_beside.at(y, x) * clamp01(nearest - hiding_px(std::fabs(own)) + 0.5f);
+        const float is_foreign = clamp01(FROM_BACKGROUND * (*unlike_around.at(y, x) - BACKGROUND));
         const float is_step = clamp01(*high.at(y, x) + *low.at(y, x) - LEAST_STEP_PX + 0.5f);
-        const float beside = is_beyond * OF_NEAR * nearest * std::min(2.0f * *share.at(y, x), 1.0f);
+        const float beside = is_beyond * is_foreign * OF_NEAR * nearest * std::min(2.0f * *share.at(y, x), 1.0f);
         const float least = doubt_ * std::max(beside, is_step * LEAST_BLUR_PX * *fading.at(y, x));
         if (std::fabs(own) < least) out_[pixel(y, x)] = least;
       }

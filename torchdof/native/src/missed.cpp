@@ -377,9 +377,11 @@ class Missed : Frame {
         read(means, tile, y, of);
       };
       const auto take = [&](int j, size_t at) {
+        const ivec is_known = known(at, of, j);
+        if (!any_of(is_known)) return;
         const vec smooth = load<vec>(of.is_smooth() + j) * GROWTH_OVER_SMOOTH_PX;
         const vec middle = lookup(MIDDLES_PX, convert(load<vec>(&ring_[at])));
-        const ivec is_known = known(at, of, j), is_taken = is_known & (max(smooth, broadcast(everywhere)) > middle);
+        const ivec is_taken = is_known & (max(smooth, broadcast(everywhere)) > middle);
         const vec is_unlike = unlike(at, of, j);
         float *const out = map_.out + pixel((int)(at / pitch_), (int)(at % pitch_));
         for (int l = 0; l < LANES; l++) {
