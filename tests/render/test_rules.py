@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from tests.scenes import furry_post, overshoots, wavy_post
 from torchdof import blur_by_coc, native
@@ -53,6 +54,8 @@ def scene_for(rule: str) -> tuple[Tensor, Tensor]:
     scene = SCENES[name]
     depth = scene.depth if rule == "whole_highlights" else degrade(scene.depth, kind)
     coc_px = scene.camera.coc_px(depth, scene.image.shape[-1])
+    if rule == "dilated":
+        coc_px = -functional.avg_pool2d(functional.max_pool2d(-coc_px, 5, 1, 2), 3, 1, 1, count_include_pad=False)
     side = None if rule in ("soft_lamps", "few_samples", "third_surfaces") else 96
     return scene.image[..., :side, :side], coc_px[..., :side, :side]
 

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn import functional
 from torch.testing import assert_close
 
-from tests.scenes import furry_post, wavy_post
+from tests.scenes import dilated_post, furry_post, wavy_post
 from torchdof import native
 from torchdof.render.rules import without
 from torchdof.render.surfaces import doubt as doubt_rule
@@ -45,18 +45,29 @@ def test_blur_only_rises_and_each_pixel_keeps_its_side_of_the_focus() -> None:
 
 
 @pytest.mark.parametrize(
-    ("near", "far", "doubt"), [(0.0, 0.9, 0.0), (0.9, 0.0, 0.0), (0.2, 0.1, 1.0), (0.02, 0.3, 0.0), (0.04, 0.04, 0.6)]
+    ("near", "far", "doubt", "dilated"),
+    [(0.0, 0.9, 0, 0), (0.9, 0.0, 0, 1), (0.2, 0.1, 1, 0), (0.02, 0.3, 0, 0), (0.04, 0.04, 0.6, 0), (0.5, 0.1, 0, 1)],
 )
-def test_a_map_is_in_doubt_if_both_sides_of_its_edges_are_contradicted(near: float, far: float, doubt: float) -> None:
+def test_a_map_is_in_doubt_if_both_sides_of_its_edges_are_contradicted_alike(
+    near: float, far: float, doubt: float, dilated: float
+) -> None:
     clear = torch.tensor([[1e4], [1e4]])
-    assert_close(
-        doubt_of(clear, clear * (1.0 - torch.tensor([[near], [far]]))), torch.tensor([doubt]), atol=0.1, rtol=0
-    )
+    found = doubt_of(clear, clear * (1.0 - torch.tensor([[near], [far]])))
+    assert_close(torch.cat(found), torch.tensor([doubt, dilated]).float(), atol=0.1, rtol=0)
 
 
-def test_few_pixels_put_no_map_in_doubt() -> None:
+def test_few_pixels_say_nothing_of_a_map() -> None:
     clear = torch.tensor([[3.0], [3.0]])
-    assert doubt_of(clear, 0.9 * clear).item() == 0.0
+    assert not torch.cat(doubt_of(clear, 0.9 * clear)).any()
+
+
+@pytest.mark.parametrize("spread", [0.02, 0.25])
+def test_a_dilated_foreground_is_narrowed_and_does_not_grow(engine: str, spread: float) -> None:
+    """Neither before a smooth background, beside which foregrounds else grow, nor before one of unclear colours."""
+    image, given, exact = dilated_post(spread)
+    is_near = exact < -6.0
+    assert ((given < -6.0) != is_near).float().mean() > 0.02
+    assert ((mended(image, given) < -6.0) != is_near).float().mean() < 0.002
 
 
 def test_a_map_that_misses_parts_is_in_doubt(engine: str) -> None:

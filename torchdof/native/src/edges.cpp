@@ -25,6 +25,7 @@ namespace {
 using namespace constants::edge_prior;
 using namespace constants::edges;  // render/surfaces/edges.py gives meanings, units and effects
 using constants::doubt::ASSUMED, constants::doubt::CONTRADICTED, constants::doubt::OFTEN_CONTRADICTED;
+using constants::doubt::MUCH_DILATED, constants::doubt::OF_FAR;
 using constants::edge_colours::SHARPNESS, constants::edge_colours::SOFT_SHARPNESS;
 using constants::edge_search::LEVELS;
 
@@ -56,7 +57,7 @@ class Repair : Planes, EdgeMap {
   // 4. Find and decide the edges of the whole frame; move pixels that have the depth of the wrong surface.
   // 5. In a soft map also remove ringing, and restore the nearness of small lamps that a blur has reduced.
   // Returns whether the map has changed, or that it stopped because of its ramps; doubt: how much the image contradicts
-  // a soft map, 0 to 1.
+  // a soft map, 0 to 1, less how far foregrounds are dilated, 0 to 1.
   Result run(double &doubt) {
     doubt = 0;
     const int every = (int)std::ceil(std::sqrt((double)area_ / SAMPLED));
@@ -92,10 +93,12 @@ class Repair : Planes, EdgeMap {
     else
       choose_edges(groups, [&](const Edge &edge) { return doubtful[given_kind_of(edge)]; });
     judge_edges(*this, groups, true, sharpness);
-    if (map_.automatic && is_soft) doubt = doubt_of(agreement) * clamp01((float)softness - 1.0f);
-    const float lost_px = move(groups, is_soft, (float)doubt);
+    const auto [in_doubt, dilated] = map_.automatic ? doubt_of(agreement) : Doubt{};
+    const float faded = is_soft ? in_doubt * clamp01((float)softness - 1.0f) : 0.0f;
+    const float lost_px = move(groups, is_soft, faded, dilated);
     if (is_soft) remove_ringing(*this);
-    if (is_soft && doubt < 1) lift_lamps(*this, sigma_of(found_), lost_px, (float)doubt);
+    if (is_soft && faded < 1) lift_lamps(*this, sigma_of(found_), lost_px, faded);
+    doubt = faded - dilated;
     return CHANGED;
   }
 
@@ -214,12 +217,20 @@ class Repair : Planes, EdgeMap {
     return agrees(false) || agrees(true);
   }
 
+  struct Doubt {
+    float in_doubt, dilated;
+  };
+
   // render/surfaces/doubt.py, doubt_of.
-  static float doubt_of(const Agreement &found) {
+  static Doubt doubt_of(const Agreement &found) {
     const auto share = [&](bool side) {
       return (float)((found.clear[side] - found.agreed[side]) / (found.clear[side] + ASSUMED));
     };
-    return clamp01((std::min(share(false), share(true)) - CONTRADICTED) / (OFTEN_CONTRADICTED - CONTRADICTED));
+    const float near = share(true), far = share(false);
+    const float doubt = clamp01((std::min(near, far) - CONTRADICTED) / (OFTEN_CONTRADICTED - CONTRADICTED)),
+                dilated = clamp01((near - OF_FAR * far - constants::doubt::DILATED) /
+                                  (MUCH_DILATED - constants::doubt::DILATED));
+    return {doubt * (1.0f - dilated), dilated};
   }
 
   // Share of pixels that show the near surface, by kind: a maximum-likelihood fit (EM) to the scores, with PRIOR_COUNT
@@ -277,15 +288,16 @@ class Repair : Planes, EdgeMap {
 
   // Decides which surface pixels show, and moves them to its nearness; on ramps in proportion to the evidence, or to
   // the doubt. Returns the width, in pixels, by which the map's near surfaces are too thin.
-  float move(const std::vector<Group> &groups, bool is_soft, float doubt) const {
-    const float lean = map_.automatic ? LEAN : 0.0f, to_blurred = map_.automatic && map_.is_coc ? TO_BLURRED : 0.0f;
+  float move(const std::vector<Group> &groups, bool is_soft, float doubt, float dilated) const {
+    const float lean = map_.automatic ? (1.0f - dilated) * LEAN : 0.0f,
+                to_blurred = map_.automatic && map_.is_coc && is_soft ? TO_BLURRED : 0.0f;
     float prior[KINDS];
     for (int k = 0; k < KINDS; k++) prior[k] = std::log(shares_[k] / (1.0f - shares_[k]));
     const auto odds = [&](const Group &group, size_t k) {
-      const float score = group.judged[k].score;
+      const float score = group.judged[k].score, undecided = 1.0f - dilated * std::min(SCORED * std::fabs(score), 1.0f);
       const Edge &edge = group.edges[k];
       return score + prior[edge.kind] + lean * clamp01(std::fabs(score) - 1.0f) +
-             (is_soft ? to_blurred * more_blurred(edge.near, edge.far) : 0.0f);
+             to_blurred * undecided * more_blurred(edge.near, edge.far);
     };
     if (is_soft)  // the chances that pixels show the near surface
       parallel((int)groups.size(), [&](int g) {

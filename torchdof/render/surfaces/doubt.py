@@ -24,6 +24,9 @@ __all__ = ["blurred_in_doubt", "doubt_of", "hiding_px"]
 _CONTRADICTED = 0.03  # share of clear pixels that contradict the map, on either side, from which it is in doubt
 _OFTEN_CONTRADICTED = 0.045  # the same from which it is fully in doubt
 _ASSUMED = 15.0  # pixels that are assumed to agree with the map; larger: maps with few edges are trusted
+_DILATED = 0.05  # share of near clear pixels that contradict the map, less that of far ones times
+_OF_FAR = 1.5  # this, above which foregrounds are too wide
+_MUCH_DILATED = 0.15  # the same from which they are by more than a pixel
 _MOVED_PX = 1.0  # px; change of the coc by which the repair of edges has half moved a pixel
 _REACH = 8  # px; distance from a blurred foreground at which its blur has faded; larger: fewer scraps, softer pictures
 _NEAR_FROM, _NEAR_SLOPE = 0.375, 4.0  # blur, over the largest around, above which a pixel is near; slope of this weight
@@ -44,19 +47,22 @@ def hiding_px(blur_px: Tensor) -> Tensor:
     return (blur_px + _APART_PX) * (1.0 / _SHARPER)
 
 
-def doubt_of(clear: Tensor, agreed: Tensor) -> Tensor:
-    """How much a map is in doubt.
+def doubt_of(clear: Tensor, agreed: Tensor) -> tuple[Tensor, Tensor]:
+    """How much a map is in doubt, and how far its foregrounds are dilated.
 
     Args:
         clear: Weights of clear pixels of near and far surfaces, ``[2, ...]``.
         agreed: Those of pixels that have the colour of the surface that the map gives them.
 
     Returns:
-        0 to 1, ``[...]``: the less contradicted side counts, because colours of a map that is only too thin, or too
-        wide, contradict it on one side, and the repair of edges cures that.
+        0 to 1, ``[...]`` each. For the doubt the less contradicted side counts, because colours of a map that is only
+        too thin, or too wide, contradict it on one side, and the repair of edges cures that. Foregrounds are dilated,
+        too wide, where the near side is contradicted much more than the far one.
     """
-    share = ((clear - agreed) / (clear + _ASSUMED)).amin(0)
-    return ((share - _CONTRADICTED) / (_OFTEN_CONTRADICTED - _CONTRADICTED)).clamp(0.0, 1.0)
+    near, far = ((clear - agreed) / (clear + _ASSUMED)).unbind(0)
+    doubt = (torch.minimum(near, far) - _CONTRADICTED) / (_OFTEN_CONTRADICTED - _CONTRADICTED)
+    dilated = ((near - _OF_FAR * far - _DILATED) / (_MUCH_DILATED - _DILATED)).clamp(0.0, 1.0)
+    return doubt.clamp(0.0, 1.0) * (1.0 - dilated), dilated
 
 
 def blurred_in_doubt(given: Tensor, repaired: Tensor, unlike: Tensor, doubt: Tensor, ops: Ops = EAGER) -> Tensor:

@@ -67,6 +67,7 @@ _EXACT = 0.025  # largest share of wrong pixels at which the steps of a map coun
 _DOUBTFUL = 0.05  # share of wrong pixels of a kind above which these pixels are decided again
 _LEAN = 2.0  # log-odds by which a far surface must win: foreground left behind is the more visible error
 _TO_BLURRED = 3.0  # log-odds for a soft map's near surface that is more blurred; larger: fewer specks, less detail
+_SCORED = 2.0  # inverse of a score at which colours alone decide about dilated foregrounds; larger: narrower ones
 _BESIDE, _DIAGONAL = 1.3, 0.8  # log-odds of a neighbour's surface in soft maps; larger: smoother edges, less detail
 
 # Soft maps: blurred by resampling, antialiased, or written by a network. Where an edge crosses a row of pixels, values
@@ -75,6 +76,8 @@ _BESIDE, _DIAGONAL = 1.3, 0.8  # log-odds of a neighbour's surface in soft maps;
 _SOFT = 0.32  # sum of :func:`_mixture` on ramps, per pixel of edge; with means over each pixel it is 0.35 to 0.5
 _WIDE = 13.0  # this sum over _SOFT; maps of a quarter of the resolution have up to 12, of an eighth 15 to 20
 _HALVINGS = 2  # most halvings of a map with wider ramps
+
+_MISSES_NOTHING = 0.5  # how far foregrounds are dilated from which they never grow
 
 # With a matte
 _MATTE_REACH = 30  # px; distance from its edge up to which foregrounds neither grow nor blur their surroundings
@@ -141,11 +144,12 @@ def mended(image: Tensor, coc_px: Tensor, edges: DepthEdges, ops: Ops = EAGER, m
         if high - low < _LEAST_STEP_PX:
             return coc_px
     given = coc_px.detach()
-    repaired, contradicted = repair(image, given, STEP_PX, auto=edges == "auto", of_coc=True, ops=ops)
+    repaired, doubt = repair(image, given, STEP_PX, auto=edges == "auto", of_coc=True, ops=ops)
     if repaired is given:
         return coc_px
-    grown, unlike, missed = completed(image, repaired, given, ops)
-    blurred = blurred_in_doubt(given, grown, unlike, torch.maximum(contradicted, missed), ops)
+    may_grow = doubt > -_MISSES_NOTHING  # else the map's foregrounds are too wide and miss nothing
+    grown, unlike, missed = completed(image, repaired, torch.where(may_grow, given, repaired), ops)
+    blurred = blurred_in_doubt(given, grown, unlike, torch.maximum(doubt, missed), ops)
     if matte is None:
         repaired = blurred
     else:
@@ -186,7 +190,8 @@ def repair(
 
     Returns:
         ``[B, 1, H, W]``, constant to autograd; unchanged pixels keep their values to the bit. ``nearness`` itself if
-        the compiled engine leaves all of it unchanged. And how much the map is in doubt, 0 to 1, ``[B, 1, 1, 1]``.
+        the compiled engine leaves all of it unchanged. And how much the map is in doubt, 0 to 1, less how far its
+        foregrounds are dilated, 0 to 1, ``[B, 1, 1, 1]``, both of :func:`.doubt.doubt_of`.
     """
     device = image.device.type
     if torch.is_autocast_enabled(device):  # which would compute in half precision
@@ -338,6 +343,7 @@ class _Errors(NamedTuple):
     prior: Tensor  # share of the pixels of each one's kind that show the near surface, [B, 1, H, W]
     doubtful: Tensor  # edge pixels that are decided, [B, 1, H, W]
     doubt: Tensor  # 0 to 1, how much the image contradicts the map, [B, 1, 1, 1]
+    dilated: Tensor  # 0 to 1, how far the map's foregrounds are too wide, [B, 1, 1, 1]
 
 
 @torch.no_grad()
@@ -384,7 +390,7 @@ def _repair(
         soft = Softness(errors.is_soft, sigma_of(scene.edges), lost / length, errors.doubt)
         repaired = lift_lamps(scene.light, scene.nearness, repaired, scene.step, soft, ops)
     repaired = torch.where(scene.valid, repaired, signed)
-    return -repaired if of_coc else repaired, errors.doubt
+    return -repaired if of_coc else repaired, errors.doubt - errors.dilated
 
 
 def _errors_of(scene: _Map, sample: _Sample, auto: bool, is_related: Tensor, ops: Ops) -> _Errors:
@@ -398,7 +404,7 @@ def _errors_of(scene: _Map, sample: _Sample, auto: bool, is_related: Tensor, ops
     prior = calibrate(scene.light, pixels.pick(kind, sampled)[0], score)[kind]
     doubt = scene.nearness.new_zeros(scene.nearness.shape[0], 1, 1, 1)
     if not auto:
-        return _Errors(is_soft, sharpness, prior, edges.is_edge, doubt)
+        return _Errors(is_soft, sharpness, prior, edges.is_edge, doubt, doubt)
 
     # colour agrees with the map at clear pixels: in the outermost ring of a step, or near a ramp's ends; on one side of
     # the edges only where the map's foreground is too thin, and at half of them where it has no relation
@@ -413,11 +419,13 @@ def _errors_of(scene: _Map, sample: _Sample, auto: bool, is_related: Tensor, ops
     is_soft = is_soft & is_related
     is_inexact = is_related & (is_soft | (doubts > _EXACT * steps))
     doubtful = edges.is_edge & is_inexact & torch.where(edges.is_ramp, is_soft, wrong > _DOUBTFUL)
+    in_doubt, dilated = doubt_of(clear, agreed)
     if active().in_doubt:
         # ramps of a pixel are means over pixels, or artefacts of compression: there is little to doubt
-        faded = doubt_of(clear, agreed) * (softness - 1.0).clamp(0.0, 1.0)
+        faded = in_doubt * (softness - 1.0).clamp(0.0, 1.0)
         doubt = torch.where(is_soft, faded.to(dtype), doubt)
-    return _Errors(is_soft, sharpness, prior, doubtful, doubt)
+    dilated = dilated.to(dtype) if active().dilated else torch.zeros_like(doubt)
+    return _Errors(is_soft, sharpness, prior, doubtful, doubt, dilated)
 
 
 def _decided(scene: _Map, errors: _Errors, score: Tensor, chosen: Tensor, auto: bool) -> Tensor:
@@ -425,15 +433,18 @@ def _decided(scene: _Map, errors: _Errors, score: Tensor, chosen: Tensor, auto: 
 
     With ``auto`` a far surface needs a lead. In soft maps the sum also has a term for a more blurred near surface, for
     a map of the coc, and one for the chances of its neighbours to show it, so that edges are smooth lines without
-    single pixels beside them.
+    single pixels beside them. If the map's foregrounds are dilated, lead and term do not count where colours say
+    something: the foregrounds would stay too wide.
     """
     rules, of_soft = active(), scene.of_item(errors.is_soft, chosen)
+    dilated = scene.of_item(errors.dilated, chosen)
     odds = score + torch.logit(pixels.pick(errors.prior, chosen)[0])
     if auto and rules.far_lead:  # without auto, correct steps are decided too, and the lead would move them
-        odds = odds + _LEAN * (score.abs() - 1.0).clamp(0.0, 1.0)
+        odds = odds + (1.0 - dilated) * _LEAN * (score.abs() - 1.0).clamp(0.0, 1.0)
     surfaces = pixels.pick(scene.looks.ends, chosen)
     if auto and scene.of_coc and rules.more_blurred:
-        odds = torch.where(of_soft, odds + _TO_BLURRED * more_blurred(surfaces), odds)
+        to_blurred = _TO_BLURRED * (1.0 - dilated * (_SCORED * score.abs()).clamp(max=1.0))
+        odds = torch.where(of_soft, odds + to_blurred * more_blurred(surfaces), odds)
     if not rules.neighbours:
         return odds > 0
     # pixels of a soft map that stick out of an edge are mostly background of a similar colour
