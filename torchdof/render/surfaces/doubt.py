@@ -5,7 +5,8 @@ leave sharp scraps beside blurred foregrounds, and rough rims on surfaces in foc
 that have the colour of the surface across the edge measures this doubt. A map that misses parts of its foregrounds
 (:mod:`.missed`) is in doubt as well: they are found only within a few pixels, and hair is longer. In doubt, a blurred
 foreground blurs its surroundings too, less with every pixel of distance and where they resemble the background, and
-everything at an edge is a little blurred.
+everything at an edge is a little blurred. Colours that contradict only the near side mean that foregrounds are too
+wide, as portrait modes draw them.
 """
 
 import torch
@@ -24,9 +25,9 @@ __all__ = ["blurred_in_doubt", "doubt_of", "hiding_px"]
 _CONTRADICTED = 0.03  # share of clear pixels that contradict the map, on either side, from which it is in doubt
 _OFTEN_CONTRADICTED = 0.045  # the same from which it is fully in doubt
 _ASSUMED = 15.0  # pixels that are assumed to agree with the map; larger: maps with few edges are trusted
-_DILATED = 0.05  # share of near clear pixels that contradict the map, less that of far ones times
-_OF_FAR = 1.5  # this, above which foregrounds are too wide
-_MUCH_DILATED = 0.15  # the same from which they are by more than a pixel
+_OF_FAR = 1.5  # part of the far side's share that is taken off the near side's; larger: only clearly wide foregrounds
+_DILATED = 0.05  # rest of the near side's share from which foregrounds are too wide
+_MUCH_DILATED = 0.15  # the same from which they fully count as too wide
 _MOVED_PX = 1.0  # px; change of the coc by which the repair of edges has half moved a pixel
 _REACH = 8  # px; distance from a blurred foreground at which its blur has faded; larger: fewer scraps, softer pictures
 _NEAR_FROM, _NEAR_SLOPE = 0.375, 4.0  # blur, over the largest around, above which a pixel is near; slope of this weight
