@@ -443,17 +443,21 @@ def wavy_post(height: int = 224, width: int = 160) -> tuple[Tensor, Tensor, Tens
     return light.clamp_min(0)[None].contiguous(), soft.contiguous(), exact
 
 
-def dilated_post(spread: float, height: int = 224, width: int = 160) -> tuple[Tensor, Tensor, Tensor]:
-    """An image of a slanted post, a map of the coc in which it is 4 px too wide and has soft edges, and the exact map.
+def dilated_post(
+    spread: float, by_px: int, widths: Sequence[int], height: int = 224, width: int = 160
+) -> tuple[Tensor, Tensor, Tensor]:
+    """An image of a slanted post, a map of the coc in which it is wider on each side and soft, and the exact map.
 
-    Light of the post and of its background varies by ``spread``, the standard deviation of its logarithm.
+    Light of the post and of its background varies by ``spread``, the standard deviation of its logarithm. Means over
+    each of ``widths`` pixels, one after the other, soften the map.
     """
     generator = torch.Generator().manual_seed(0)
     columns, rows = torch.arange(width), torch.arange(height)[:, None]
     beside = (columns - 70 + 0.3 * (rows - height // 2)).abs() - 20
     light = torch.where(beside < 0, 0.25, 0.6) * torch.exp(spread * torch.randn(height, width, generator=generator))
-    wide = torch.where(beside < 2, -12.0, 0.5).expand(1, 1, -1, -1)
-    soft = functional.avg_pool2d(functional.pad(wide, (1,) * 4, mode="replicate"), 3, 1)
+    soft = torch.where(beside < by_px, -12.0, 0.5).expand(1, 1, -1, -1)
+    for side in widths:
+        soft = functional.avg_pool2d(functional.pad(soft, (side // 2,) * 4, mode="replicate"), side, 1)
     exact = torch.where(beside < 0, -12.0, 0.5)[None, None]
     return light.expand(1, 3, -1, -1).contiguous(), soft.contiguous(), exact
 

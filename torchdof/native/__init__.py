@@ -412,9 +412,9 @@ def repair_edges(
     """Repairs the edges of a depth map, as :func:`torchdof.render.surfaces.edges.repair`, for one image.
 
     ``light`` is ``[C, H, W]``, ``nearness`` ``[H, W]``, ``step`` ``[H, W]`` or ``[]``. The results are the map, the
-    input itself if it needs no repair, how much it is in doubt less how far its foregrounds are dilated, 0 to 1 each, and
-    whether the repair has stopped because of ramps too wide to be found, with ``stops_if_wide``. ``is_related``: the
-    colours are known to be related to the map.
+    input itself if it needs no repair, how much it is in doubt, 0 to 1, less how far its foregrounds are dilated, 0 to
+    2, and whether the repair has stopped because of ramps too wide to be found, with ``stops_if_wide``. ``is_related``:
+    the colours are known to be related to the map.
     """
     steps = (None, float(step)) if step.ndim == 0 else (step, 0.0)
     out, changed, doubt = _empty(*nearness.shape), ctypes.c_int32(0), ctypes.c_double(0.0)

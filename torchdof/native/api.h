@@ -127,7 +127,7 @@ typedef struct {
 } torchdof_map;
 
 // changed: 0 if the map needs no repair, 2 if it stops because of its ramps; out is then not written. doubt: how much
-// the map is in doubt less how far its foregrounds are dilated, 0 to 1 each.
+// the map is in doubt, 0 to 1, less how far its foregrounds are dilated, 0 to 2.
 TORCHDOF_API int32_t torchdof_repair_edges(const torchdof_map *map, int32_t *changed, double *doubt);
 
 // Gives missed fine parts of blurred foregrounds to them, in a map of coc; reads no members from steps to is_related.

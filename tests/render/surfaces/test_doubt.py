@@ -46,7 +46,15 @@ def test_blur_only_rises_and_each_pixel_keeps_its_side_of_the_focus() -> None:
 
 @pytest.mark.parametrize(
     ("near", "far", "doubt", "dilated"),
-    [(0.0, 0.9, 0, 0), (0.9, 0.0, 0, 1), (0.2, 0.1, 1, 0), (0.02, 0.3, 0, 0), (0.04, 0.04, 0.6, 0), (0.5, 0.1, 0, 1)],
+    [
+        (0.0, 0.9, 0, 0),
+        (0.9, 0.0, 0, 1),
+        (0.2, 0.1, 1, 0),
+        (0.02, 0.3, 0, 0),
+        (0.04, 0.04, 0.6, 0),
+        (0.5, 0.05, 0, 1),
+        (0.5, 0.1, 0, 2),
+    ],
 )
 def test_a_map_is_in_doubt_if_both_sides_of_its_edges_are_contradicted_alike(
     near: float, far: float, doubt: float, dilated: float
@@ -61,13 +69,34 @@ def test_few_pixels_say_nothing_of_a_map() -> None:
     assert not torch.cat(doubt_of(clear, 0.9 * clear)).any()
 
 
-@pytest.mark.parametrize("spread", [0.02, 0.25])
-def test_a_dilated_foreground_is_narrowed_and_does_not_grow(engine: str, spread: float) -> None:
-    """Neither before a smooth background, beside which foregrounds else grow, nor before one of unclear colours."""
-    image, given, exact = dilated_post(spread)
+@pytest.mark.parametrize(
+    ("spread", "by_px", "widths"), [(0.02, 2, [3]), (0.25, 2, [3]), (0.1, 5, [5, 5]), (0.25, 5, [5, 5])]
+)
+def test_a_dilated_foreground_is_narrowed_and_does_not_grow(
+    engine: str, spread: float, by_px: int, widths: list[int]
+) -> None:
+    """Neither before a smooth background, beside which foregrounds else grow, nor before one of unclear colours.
+
+    By 5 px it is too wide for the window in which surfaces are found, and is eroded first.
+    """
+    image, given, exact = dilated_post(spread, by_px, widths)
     is_near = exact < -6.0
     assert ((given < -6.0) != is_near).float().mean() > 0.02
-    assert ((mended(image, given) < -6.0) != is_near).float().mean() < 0.002
+    assert ((mended(image, given) < -6.0) != is_near).float().mean() < 0.004
+
+
+def test_erosion_keeps_invalid_values_and_the_items_that_need_none(engine: str) -> None:
+    image, given, _ = dilated_post(0.1, 5, [5, 5])
+    given[..., 100, 60] = torch.nan
+    other = torch.full_like(given, 0.5)
+    other[..., :80] = -12.0
+    images, cocs = torch.cat([image, image]), torch.cat([given, other])
+    repaired, doubt = edges.repair(images, cocs, edges.STEP_PX, True, True)
+    assert float(doubt[0]) == -2.0
+    assert bool(repaired[0].isnan().equal(given[0].isnan()))
+    alone, its_doubt = edges.repair(image, other, edges.STEP_PX, True, True)
+    assert_close(repaired[1:], alone, atol=0, rtol=0)
+    assert_close(doubt[1:], its_doubt, atol=0, rtol=0)
 
 
 def test_a_map_that_misses_parts_is_in_doubt(engine: str) -> None:

@@ -25,7 +25,8 @@ namespace {
 using namespace constants::edge_prior;
 using namespace constants::edges;  // render/surfaces/edges.py gives meanings, units and effects
 using constants::doubt::ASSUMED, constants::doubt::CONTRADICTED, constants::doubt::OFTEN_CONTRADICTED;
-using constants::doubt::MUCH_DILATED, constants::doubt::OF_FAR;
+using constants::doubt::BEYOND_FAR, constants::doubt::BEYOND_NEAR, constants::doubt::MUCH_DILATED,
+    constants::doubt::OF_FAR;
 using constants::edge_colours::SHARPNESS, constants::edge_colours::SOFT_SHARPNESS;
 using constants::edge_search::LEVELS;
 
@@ -57,7 +58,7 @@ class Repair : Planes, EdgeMap {
   // 4. Find and decide the edges of the whole frame; move pixels that have the depth of the wrong surface.
   // 5. In a soft map also remove ringing, and restore the nearness of small lamps that a blur has reduced.
   // Returns whether the map has changed, or that it stopped because of its ramps; doubt: how much the image contradicts
-  // a soft map, 0 to 1, less how far foregrounds are dilated, 0 to 1.
+  // a soft map, 0 to 1, less how far foregrounds are dilated, 0 to 2.
   Result run(double &doubt) {
     doubt = 0;
     const int every = (int)std::ceil(std::sqrt((double)area_ / SAMPLED));
@@ -95,7 +96,7 @@ class Repair : Planes, EdgeMap {
     judge_edges(*this, groups, true, sharpness);
     const auto [in_doubt, dilated] = map_.automatic ? doubt_of(agreement) : Doubt{};
     const float faded = is_soft ? in_doubt * clamp01((float)softness - 1.0f) : 0.0f;
-    const float lost_px = move(groups, is_soft, faded, dilated);
+    const float lost_px = move(groups, is_soft, faded, std::min(dilated, 1.0f));
     if (is_soft) remove_ringing(*this);
     if (is_soft && faded < 1) lift_lamps(*this, sigma_of(found_), lost_px, faded);
     doubt = faded - dilated;
@@ -228,9 +229,10 @@ class Repair : Planes, EdgeMap {
     };
     const float near = share(true), far = share(false);
     const float doubt = clamp01((std::min(near, far) - CONTRADICTED) / (OFTEN_CONTRADICTED - CONTRADICTED)),
-                dilated = clamp01((near - OF_FAR * far - constants::doubt::DILATED) /
-                                  (MUCH_DILATED - constants::doubt::DILATED));
-    return {doubt * (1.0f - dilated), dilated};
+                excess = (near - OF_FAR * far - constants::doubt::DILATED) / (MUCH_DILATED - constants::doubt::DILATED);
+    const bool is_beyond = near > BEYOND_NEAR && near > OF_FAR * far && far > BEYOND_FAR;
+    const float dilated = is_beyond ? 2.0f : clamp01(excess);
+    return {doubt * std::max(1.0f - dilated, 0.0f), dilated};
   }
 
   // Share of pixels that show the near surface, by kind: a maximum-likelihood fit (EM) to the scores, with PRIOR_COUNT

@@ -28,6 +28,7 @@ _ASSUMED = 15.0  # pixels that are assumed to agree with the map; larger: maps w
 _OF_FAR = 1.5  # part of the far side's share that is taken off the near side's; larger: only clearly wide foregrounds
 _DILATED = 0.05  # rest of the near side's share from which foregrounds are too wide
 _MUCH_DILATED = 0.15  # the same from which they fully count as too wide
+_BEYOND_NEAR, _BEYOND_FAR = 0.3, 0.06  # shares of both sides above which dilated ones are so beyond the repair's reach
 _MOVED_PX = 1.0  # px; change of the coc by which the repair of edges has half moved a pixel
 _REACH = 8  # px; distance from a blurred foreground at which its blur has faded; larger: fewer scraps, softer pictures
 _NEAR_FROM, _NEAR_SLOPE = 0.375, 4.0  # blur, over the largest around, above which a pixel is near; slope of this weight
@@ -56,14 +57,17 @@ def doubt_of(clear: Tensor, agreed: Tensor) -> tuple[Tensor, Tensor]:
         agreed: Those of pixels that have the colour of the surface that the map gives them.
 
     Returns:
-        0 to 1, ``[...]`` each. For the doubt the less contradicted side counts, because colours of a map that is only
-        too thin, or too wide, contradict it on one side, and the repair of edges cures that. Foregrounds are dilated,
-        too wide, where the near side is contradicted much more than the far one.
+        ``[...]`` each. The doubt, 0 to 1: the less contradicted side counts, because colours of a map that is only
+        too thin, or too wide, contradict it on one side, and the repair of edges cures that. And how far foregrounds
+        are dilated, too wide, 0 to 1, or 2 beyond the reach of the repair: the near side is contradicted much more than
+        the far one. Beyond that reach some far pixels contradict the map too, because near colours are not found.
     """
     near, far = ((clear - agreed) / (clear + _ASSUMED)).unbind(0)
     doubt = (torch.minimum(near, far) - _CONTRADICTED) / (_OFTEN_CONTRADICTED - _CONTRADICTED)
     dilated = ((near - _OF_FAR * far - _DILATED) / (_MUCH_DILATED - _DILATED)).clamp(0.0, 1.0)
-    return doubt.clamp(0.0, 1.0) * (1.0 - dilated), dilated
+    is_beyond = (near > _BEYOND_NEAR) & (near > _OF_FAR * far) & (far > _BEYOND_FAR)
+    dilated = torch.where(is_beyond, 2.0, dilated)
+    return doubt.clamp(0.0, 1.0) * (1.0 - dilated).clamp_min(0.0), dilated
 
 
 def blurred_in_doubt(given: Tensor, repaired: Tensor, unlike: Tensor, doubt: Tensor, ops: Ops = EAGER) -> Tensor:

@@ -12,6 +12,7 @@ estimation turn an edge into averages of it.
 """
 
 import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -45,7 +46,7 @@ from .edge_prior import PRIOR_COUNT, weight_of
 from .edge_search import REACH, RINGS, Edges
 from .missed import completed
 from .soft_maps import Softness, lift_lamps, sigma_of, without_ringing
-from .windows import LARGEST, highest
+from .windows import LARGEST, NEVER, highest
 
 __all__ = ["STEP_PX", "judged", "mended", "repair", "repair_edges"]
 
@@ -77,6 +78,8 @@ _SOFT = 0.32  # sum of :func:`_mixture` on ramps, per pixel of edge; with means 
 _WIDE = 13.0  # this sum over _SOFT; maps of a quarter of the resolution have up to 12, of an eighth 15 to 20
 _HALVINGS = 2  # most halvings of a map with wider ramps
 
+_MOST_ERODED_PX = 6  # px; by which foregrounds are eroded at most before a repair
+_BEYOND_REACH = 1.5  # how far they are dilated from which they are eroded
 _MISSES_NOTHING = 0.5  # how far foregrounds are dilated from which they never grow
 
 # With a matte
@@ -191,12 +194,47 @@ def repair(
     Returns:
         ``[B, 1, H, W]``, constant to autograd; unchanged pixels keep their values to the bit. ``nearness`` itself if
         the compiled engine leaves all of it unchanged. And how much the map is in doubt, 0 to 1, less how far its
-        foregrounds are dilated, 0 to 1, ``[B, 1, 1, 1]``, both of :func:`.doubt.doubt_of`.
+        foregrounds are dilated, 0 to 2, ``[B, 1, 1, 1]``, both of :func:`.doubt.doubt_of`.
     """
     device = image.device.type
     if torch.is_autocast_enabled(device):  # which would compute in half precision
         with torch.autocast(device, enabled=False):
             return repair(image, nearness, step, auto, of_coc, ops, halvings)
+    once = functools.partial(_repaired, image, step=step, auto=auto, of_coc=of_coc, ops=ops, halvings=halvings)
+    # in graphs this would multiply the time of their export; the operator of compiled code does it itself
+    return once(nearness) if is_traced() or is_compiled() else _from_eroded(once, nearness, of_coc)
+
+
+def _from_eroded(
+    once: Callable[[Tensor], tuple[Tensor, Tensor]], nearness: Tensor, of_coc: bool
+) -> tuple[Tensor, Tensor]:
+    """Repairs a map, whose foregrounds are first eroded if they are dilated beyond the reach of a repair.
+
+    ``once`` repairs a map as :func:`repair`. The doubt is that of the given map, whose foregrounds miss nothing.
+    """
+    repaired, doubt = once(nearness)
+    latest = doubt
+    for _ in range(_MOST_ERODED_PX):
+        is_wide = latest < -_BEYOND_REACH
+        if not is_wide.any():
+            break
+        nearness = torch.where(is_wide, _eroded(nearness, of_coc), nearness)
+        again, latest = once(nearness)
+        repaired = torch.where(is_wide, again, repaired)
+    return repaired, doubt
+
+
+def _eroded(nearness: Tensor, of_coc: bool) -> Tensor:
+    """A map whose near surfaces are narrower by a pixel on each side. Invalid values stay."""
+    sign, valid = -1.0 if of_coc else 1.0, nearness.abs() <= LARGEST
+    far = highest(torch.where(valid, -sign * nearness, -NEVER), 1)
+    return torch.where(valid, -sign * far, nearness)
+
+
+def _repaired(
+    image: Tensor, nearness: Tensor, step: Tensor | float, auto: bool, of_coc: bool, ops: Ops, halvings: int
+) -> tuple[Tensor, Tensor]:
+    """:func:`repair` of one map, by one of the engines."""
     image = image.detach()
     light, given = image.float(), nearness.float().expand(image.shape[0], -1, -1, -1)
     step = torch.as_tensor(step, dtype=given.dtype, device=given.device)
@@ -343,7 +381,7 @@ class _Errors(NamedTuple):
     prior: Tensor  # share of the pixels of each one's kind that show the near surface, [B, 1, H, W]
     doubtful: Tensor  # edge pixels that are decided, [B, 1, H, W]
     doubt: Tensor  # 0 to 1, how much the image contradicts the map, [B, 1, 1, 1]
-    dilated: Tensor  # 0 to 1, how far the map's foregrounds are too wide, [B, 1, 1, 1]
+    dilated: Tensor  # 0 to 2, how far the map's foregrounds are too wide, [B, 1, 1, 1]
 
 
 @torch.no_grad()
@@ -437,7 +475,7 @@ def _decided(scene: _Map, errors: _Errors, score: Tensor, chosen: Tensor, auto: 
     something: the foregrounds would stay too wide.
     """
     rules, of_soft = active(), scene.of_item(errors.is_soft, chosen)
-    dilated = scene.of_item(errors.dilated, chosen)
+    dilated = scene.of_item(errors.dilated, chosen).clamp(max=1.0)
     odds = score + torch.logit(pixels.pick(errors.prior, chosen)[0])
     if auto and rules.far_lead:  # without auto, correct steps are decided too, and the lead would move them
         odds = odds + (1.0 - dilated) * _LEAN * (score.abs() - 1.0).clamp(0.0, 1.0)
@@ -492,5 +530,6 @@ def _empty(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bo
 # The number of pixels to process depends on the data, which compiled graphs do not support.
 @one_operator("torchdof::repair_edges", _empty)
 def _operator(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool) -> tuple[Tensor, Tensor]:
-    repaired, doubt = _repair(image, nearness, step, auto, of_coc)
+    once = functools.partial(_repair, image, step=step, auto=auto, of_coc=of_coc)
+    repaired, doubt = _from_eroded(once, nearness, of_coc)
     return repaired.clone(), doubt
