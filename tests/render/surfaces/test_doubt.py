@@ -99,6 +99,14 @@ def test_erosion_keeps_invalid_values_and_the_items_that_need_none(engine: str) 
     assert_close(doubt[1:], its_doubt, atol=0, rtol=0)
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
+def test_maps_of_other_types_are_eroded_too(engine: str, dtype: torch.dtype) -> None:
+    image, given, exact = dilated_post(0.1, 5, [5, 5])
+    coc = mended(image, given.to(dtype))
+    assert coc.dtype == dtype
+    assert ((coc < -6.0) != (exact < -6.0)).float().mean() < 0.004
+
+
 def test_a_map_that_misses_parts_is_in_doubt(engine: str) -> None:
     """Colours do not contradict it, but its hair is longer than it can grow."""
     image, given, _ = furry_post(noise=0.1)

@@ -226,9 +226,10 @@ def _from_eroded(
 
 def _eroded(nearness: Tensor, of_coc: bool) -> Tensor:
     """A map whose near surfaces are narrower by a pixel on each side. Invalid values stay."""
-    sign, valid = -1.0 if of_coc else 1.0, nearness.abs() <= LARGEST
-    far = highest(torch.where(valid, -sign * nearness, -NEVER), 1)
-    return torch.where(valid, -sign * far, nearness)
+    wide, sign = nearness.to(torch.promote_types(nearness.dtype, torch.float32)), -1.0 if of_coc else 1.0
+    valid = wide.abs() <= LARGEST
+    far = highest(torch.where(valid, -sign * wide, -NEVER), 1)
+    return torch.where(valid, (-sign * far).to(nearness.dtype), nearness)
 
 
 def _repaired(
