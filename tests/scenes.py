@@ -18,6 +18,7 @@ from torchdof.render.highlights import threshold
 from torchdof.render.layers.layer_weights import from_blur_axis
 from torchdof.render.layers.plan import Plan
 from torchdof.render.surfaces.border import continued
+from torchdof.render.surfaces.windows import mean_around
 
 HEIGHT, WIDTH = 24, 32
 CAMERA = Camera(focal_length_mm=50.0, f_number=2.0, focus_m=2.0, sensor_width_mm=4.0)  # 4 px at infinity
@@ -438,26 +439,24 @@ def wavy_post(height: int = 224, width: int = 160) -> tuple[Tensor, Tensor, Tens
     bends = beside + 0.5 + 3.5 * torch.sin(2 * math.pi * rows / 20)
     soft = torch.where(bends < 0, -12.0, 0.5)[None, None]
     for _ in range(2):
-        soft = functional.avg_pool2d(functional.pad(soft, (2,) * 4, mode="replicate"), 5, 1)
+        soft = mean_around(soft, 2)
     exact = torch.where(beside < 0, -12.0, 0.5).expand(1, 1, height, -1)
     return light.clamp_min(0)[None].contiguous(), soft.contiguous(), exact
 
 
-def dilated_post(
-    spread: float, by_px: int, widths: Sequence[int], height: int = 224, width: int = 160
-) -> tuple[Tensor, Tensor, Tensor]:
+def dilated_post(spread: float, by_px: int, widths: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
     """An image of a slanted post, a map of the coc in which it is wider on each side and soft, and the exact map.
 
     Light of the post and of its background varies by ``spread``, the standard deviation of its logarithm. Means over
     each of ``widths`` pixels, one after the other, soften the map.
     """
     generator = torch.Generator().manual_seed(0)
-    columns, rows = torch.arange(width), torch.arange(height)[:, None]
-    beside = (columns - 70 + 0.3 * (rows - height // 2)).abs() - 20
-    light = torch.where(beside < 0, 0.25, 0.6) * torch.exp(spread * torch.randn(height, width, generator=generator))
+    columns, rows = torch.arange(160), torch.arange(224)[:, None]
+    beside = (columns - 70 + 0.3 * (rows - 112)).abs() - 20
+    light = torch.where(beside < 0, 0.25, 0.6) * torch.exp(spread * torch.randn(beside.shape, generator=generator))
     soft = torch.where(beside < by_px, -12.0, 0.5).expand(1, 1, -1, -1)
     for side in widths:
-        soft = functional.avg_pool2d(functional.pad(soft, (side // 2,) * 4, mode="replicate"), side, 1)
+        soft = mean_around(soft, side // 2)
     exact = torch.where(beside < 0, -12.0, 0.5)[None, None]
     return light.expand(1, 3, -1, -1).contiguous(), soft.contiguous(), exact
 

@@ -5,7 +5,6 @@ from pathlib import Path
 import pytest
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from tests.scenes import furry_post, overshoots, wavy_post
 from torchdof import blur_by_coc, native
@@ -13,6 +12,7 @@ from torchdof.options import DepthEdges
 from torchdof.reference.degraded import degrade
 from torchdof.reference.scenes import read_scenes
 from torchdof.render.rules import RULES, without
+from torchdof.render.surfaces.windows import highest, mean_around
 
 SCENES = {scene.name: scene for scene in read_scenes(Path(__file__).parents[1] / "data" / "scenes")}
 # what each rule needs to be seen; all others are seen on depth of half the size
@@ -55,7 +55,7 @@ def scene_for(rule: str) -> tuple[Tensor, Tensor]:
     depth = scene.depth if rule == "whole_highlights" else degrade(scene.depth, kind)
     coc_px = scene.camera.coc_px(depth, scene.image.shape[-1])
     if rule == "dilated":
-        coc_px = -functional.avg_pool2d(functional.max_pool2d(-coc_px, 5, 1, 2), 3, 1, 1, count_include_pad=False)
+        coc_px = -mean_around(highest(-coc_px, 2), 1)
     side = None if rule in ("soft_lamps", "few_samples", "third_surfaces") else 96
     return scene.image[..., :side, :side], coc_px[..., :side, :side]
 

@@ -79,7 +79,6 @@ _WIDE = 13.0  # this sum over _SOFT; maps of a quarter of the resolution have up
 _HALVINGS = 2  # most halvings of a map with wider ramps
 
 _MOST_ERODED_PX = 6  # px; by which foregrounds are eroded at most before a repair
-_BEYOND_REACH = 1.5  # how far they are dilated from which they are eroded
 _MISSES_NOTHING = 0.5  # how far foregrounds are dilated from which they never grow
 
 # With a matte
@@ -202,7 +201,7 @@ def repair(
             return repair(image, nearness, step, auto, of_coc, ops, halvings)
     once = functools.partial(_repaired, image, step=step, auto=auto, of_coc=of_coc, ops=ops, halvings=halvings)
     # in graphs this would multiply the time of their export; the operator of compiled code does it itself
-    return once(nearness) if is_traced() or is_compiled() else _from_eroded(once, nearness, of_coc)
+    return once(nearness) if is_traced() else _from_eroded(once, nearness, of_coc)
 
 
 def _from_eroded(
@@ -210,12 +209,13 @@ def _from_eroded(
 ) -> tuple[Tensor, Tensor]:
     """Repairs a map, whose foregrounds are first eroded if they are dilated beyond the reach of a repair.
 
-    ``once`` repairs a map as :func:`repair`. The doubt is that of the given map, whose foregrounds miss nothing.
+    ``once`` repairs a map as :func:`repair`; only dilation beyond its reach makes the doubt less than -1. The returned
+    doubt is that of the given map, whose foregrounds miss nothing.
     """
     repaired, doubt = once(nearness)
     latest = doubt
     for _ in range(_MOST_ERODED_PX):
-        is_wide = latest < -_BEYOND_REACH
+        is_wide = latest < -1.0
         if not is_wide.any():
             break
         nearness = torch.where(is_wide, _eroded(nearness, of_coc), nearness)
