@@ -444,11 +444,11 @@ def wavy_post(height: int = 224, width: int = 160) -> tuple[Tensor, Tensor, Tens
     return light.clamp_min(0)[None].contiguous(), soft.contiguous(), exact
 
 
-def dilated_post(spread: float, by_px: int, widths: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
-    """An image of a slanted post, a map of the coc in which it is wider on each side and soft, and the exact map.
+def resized_post(spread: float, by_px: int, widths: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
+    """An image of a slanted post, a map of the coc in which it is wider by ``by_px`` on each side, and the exact map.
 
     Light of the post and of its background varies by ``spread``, the standard deviation of its logarithm. Means over
-    each of ``widths`` pixels, one after the other, soften the map.
+    each of ``widths`` pixels, one after the other, soften the map; without any it is hard.
     """
     generator = torch.Generator().manual_seed(0)
     columns, rows = torch.arange(160), torch.arange(224)[:, None]

@@ -275,12 +275,14 @@ void check_edges(unsigned seed) {
                               int(seed) % 5 == 0,
                               int(seed) % 7 == 0,
                               int(seed) % 4 == 0,
+                              int(seed) % 3 == 0,
                               threads,
                               &never,
                               out.data()};
-    int32_t changed = 0;
+    int32_t changed = 0, resizing = 0;
     double doubt = 0.0;
-    if (torchdof_repair_edges(&map, &changed, &doubt) != TORCHDOF_OK) fail("its edges cannot be repaired", int(seed));
+    if (torchdof_repair_edges(&map, &changed, &doubt, &resizing) != TORCHDOF_OK)
+      fail("its edges cannot be repaired", int(seed));
     if (changed != 1) out = nearness;
     if (map.is_coc) {
       const std::vector<float> repaired = out;

@@ -408,19 +408,25 @@ def repair_edges(
     of_coc: bool = False,
     stops_if_wide: bool = False,
     is_related: bool = False,
-) -> tuple[Tensor, float, bool]:
+    stops_to_resize: bool = False,
+) -> tuple[Tensor, float, bool, int]:
     """Repairs the edges of a depth map, as :func:`torchdof.render.surfaces.edges.repair`, for one image.
 
     ``light`` is ``[C, H, W]``, ``nearness`` ``[H, W]``, ``step`` ``[H, W]`` or ``[]``. The results are the map, the
     input itself if it needs no repair, how much it is in doubt, 0 to 1, less how far its foregrounds are dilated, 0 to
-    2, and whether the repair has stopped because of ramps too wide to be found, with ``stops_if_wide``. ``is_related``:
-    the colours are known to be related to the map.
+    1, whether the repair has stopped because of ramps too wide to be found, with ``stops_if_wide``, and whether
+    foregrounds are too thin, 1, or too wide, -1; ``stops_to_resize`` then leaves the map as it is. ``is_related``: the
+    colours are known to be related to the map.
     """
     steps = (None, float(step)) if step.ndim == 0 else (step, 0.0)
-    out, changed, doubt = _empty(*nearness.shape), ctypes.c_int32(0), ctypes.c_double(0.0)
-    options = (of_coc, *steps, auto, stops_if_wide, is_related)
-    _of_map("repair_edges", light, nearness, options, out, changed, doubt)
-    return out if changed.value == 1 else nearness, doubt.value, changed.value == _STOPPED
+    out, changed, resizing, doubt = (
+        _empty(*nearness.shape),
+        *(ctypes.c_int32(0) for _ in range(2)),
+        ctypes.c_double(0.0),
+    )
+    options = (of_coc, *steps, auto, stops_if_wide, is_related, stops_to_resize)
+    _of_map("repair_edges", light, nearness, options, out, changed, doubt, resizing)
+    return out if changed.value == 1 else nearness, doubt.value, changed.value == _STOPPED, resizing.value
 
 
 def missed_parts(light: Tensor, coc_px: Tensor) -> tuple[Tensor, float]:
@@ -430,7 +436,7 @@ def missed_parts(light: Tensor, coc_px: Tensor) -> tuple[Tensor, float]:
     is, ``[2, H, W]``, and how far the map has missed parts, 0 to 1.
     """
     out, share = _empty(2, *coc_px.shape), ctypes.c_double(0.0)
-    _of_map("missed_parts", light, coc_px, (True, None, 0.0, False, False, False), out, share)
+    _of_map("missed_parts", light, coc_px, (True, None, 0.0, *(False,) * 4), out, share)
     return out, share.value
 
 

@@ -7,6 +7,7 @@
 
 #include "api.h"
 #include "constants/doubt.h"
+#include "constants/resizing.h"
 #include "constants/edge_colours.h"
 #include "constants/edge_prior.h"
 #include "constants/edges.h"
@@ -25,10 +26,11 @@ namespace {
 using namespace constants::edge_prior;
 using namespace constants::edges;  // render/surfaces/edges.py gives meanings, units and effects
 using constants::doubt::ASSUMED, constants::doubt::CONTRADICTED, constants::doubt::OFTEN_CONTRADICTED;
-using constants::doubt::BEYOND_FAR, constants::doubt::BEYOND_NEAR, constants::doubt::MUCH_DILATED,
-    constants::doubt::OF_FAR;
+using constants::doubt::MUCH_DILATED, constants::doubt::OF_OTHER;
 using constants::edge_colours::SHARPNESS, constants::edge_colours::SOFT_SHARPNESS;
 using constants::edge_search::LEVELS;
+using constants::resizing::ALL_SIDES, constants::resizing::OTHER_SIDE, constants::resizing::THIN,
+    constants::resizing::WIDE_FAR;
 
 // Weights of the clearest edge pixels of far surfaces and of near ones, and of those that have the right colour.
 struct Agreement {
@@ -58,9 +60,10 @@ class Repair : Planes, EdgeMap {
   // 4. Find and decide the edges of the whole frame; move pixels that have the depth of the wrong surface.
   // 5. In a soft map also remove ringing, and restore the nearness of small lamps that a blur has reduced.
   // Returns whether the map has changed, or that it stopped because of its ramps; doubt: how much the image contradicts
-  // a soft map, 0 to 1, less how far foregrounds are dilated, 0 to 2.
-  Result run(double &doubt) {
-    doubt = 0;
+  // a soft map, 0 to 1, less how far foregrounds are dilated, 0 to 1; resizing: whether they are too thin, 1, or too
+  // wide, -1.
+  Result run(double &doubt, int &resizing) {
+    doubt = resizing = 0;
     const int every = (int)std::ceil(std::sqrt((double)area_ / SAMPLED));
     // where the sample is a small part of the frame, only its edges are found first
     const bool finds_twice = map_.automatic && every > 4;
@@ -84,8 +87,12 @@ class Repair : Planes, EdgeMap {
     judge_edges(*this, sampled, false, sharpness);
     calibrate(sampled);
     const Agreement agreement = agreement_of(sampled);
-    if (map_.automatic && (!(map_.is_related || is_related(agreement)) || !(is_soft || is_inexact(sampled))))
-      return UNCHANGED;
+    if (map_.automatic) {
+      resizing = resizing_of(agreement, is_soft);
+      if (map_.stops_to_resize && resizing) return UNCHANGED;
+      if (!(map_.is_related || resizing || is_related(agreement)) || !(is_soft || is_inexact(sampled)))
+        return UNCHANGED;
+    }
     parallel(height_,
              [&](int y) { memcpy(map_.out + pixel(y, 0), map_.nearness + pixel(y, 0), width_ * sizeof(float)); });
     const KindMask doubtful = map_.automatic ? doubtful_kinds(is_soft) : all_kinds;
@@ -96,7 +103,7 @@ class Repair : Planes, EdgeMap {
     judge_edges(*this, groups, true, sharpness);
     const auto [in_doubt, dilated] = map_.automatic ? doubt_of(agreement) : Doubt{};
     const float faded = is_soft ? in_doubt * clamp01((float)softness - 1.0f) : 0.0f;
-    const float lost_px = move(groups, is_soft, faded, std::min(dilated, 1.0f));
+    const float lost_px = move(groups, is_soft, faded, dilated);
     if (is_soft) remove_ringing(*this);
     if (is_soft && faded < 1) lift_lamps(*this, sigma_of(found_), lost_px, faded);
     doubt = faded - dilated;
@@ -222,17 +229,37 @@ class Repair : Planes, EdgeMap {
     float in_doubt, dilated;
   };
 
+  // render/surfaces/doubt.py, contradicted: of the near side, or the far one.
+  static float contradicted(const Agreement &found, bool side) {
+    return (float)((found.clear[side] - found.agreed[side]) / (found.clear[side] + ASSUMED));
+  }
+
   // render/surfaces/doubt.py, doubt_of.
   static Doubt doubt_of(const Agreement &found) {
-    const auto share = [&](bool side) {
-      return (float)((found.clear[side] - found.agreed[side]) / (found.clear[side] + ASSUMED));
-    };
-    const float near = share(true), far = share(false);
-    const float doubt = clamp01((std::min(near, far) - CONTRADICTED) / (OFTEN_CONTRADICTED - CONTRADICTED)),
-                excess = (near - OF_FAR * far - constants::doubt::DILATED) / (MUCH_DILATED - constants::doubt::DILATED);
-    const bool is_beyond = near > BEYOND_NEAR && near > OF_FAR * far && far > BEYOND_FAR;
-    const float dilated = is_beyond ? 2.0f : clamp01(excess);
-    return {doubt * std::max(1.0f - dilated, 0.0f), dilated};
+    const float near = contradicted(found, true), far = contradicted(found, false);
+    const float doubt = clamp01((std::min(near, far) - CONTRADICTED) / (OFTEN_CONTRADICTED - CONTRADICTED));
+    const float dilated =
+        clamp01((near - OF_OTHER * far - constants::doubt::DILATED) / (MUCH_DILATED - constants::doubt::DILATED));
+    return {doubt * (1.0f - dilated), dilated};
+  }
+
+  // render/surfaces/resizing.py, resizing_of.
+  int resizing_of(const Agreement &found, bool is_soft) const {
+    const float near = contradicted(found, true), far = contradicted(found, false);
+    bool is_thin = far > THIN && far > OF_OTHER * near,
+         is_wide = near > constants::resizing::WIDE && near > OF_OTHER * far && far > WIDE_FAR;
+    if (!is_soft) {
+      float lowest[2] = {1, 1}, highest[2] = {};
+      for (int side = 0; side < 2; side++)
+        for (int direction = 0; direction < DIRECTIONS; direction++) {
+          const float wrong = this->wrong(side * (RINGS * DIRECTIONS + KINDS) + direction);
+          lowest[side] = std::min(lowest[side], wrong);
+          highest[side] = std::max(highest[side], wrong);
+        }
+      is_thin = is_thin || (lowest[0] > ALL_SIDES && highest[1] < OTHER_SIDE);
+      is_wide = is_wide || (lowest[1] > ALL_SIDES && highest[0] < OTHER_SIDE);
+    }
+    return is_thin - is_wide;
   }
 
   // Share of pixels that show the near surface, by kind: a maximum-likelihood fit (EM) to the scores, with PRIOR_COUNT
@@ -345,6 +372,6 @@ class Repair : Planes, EdgeMap {
 }  // namespace
 }  // namespace torchdof
 
-int32_t torchdof_repair_edges(const torchdof_map *map, int32_t *changed, double *doubt) {
-  return torchdof::guarded([&] { *changed = torchdof::Repair(*map).run(*doubt); });
+int32_t torchdof_repair_edges(const torchdof_map *map, int32_t *changed, double *doubt, int32_t *resizing) {
+  return torchdof::guarded([&] { *changed = torchdof::Repair(*map).run(*doubt, *resizing); });
 }

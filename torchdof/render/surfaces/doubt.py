@@ -20,15 +20,16 @@ from ..engines.ops import EAGER, Ops
 from ..rules import active
 from .windows import LARGEST, NEVER, highest, mean_around
 
-__all__ = ["blurred_in_doubt", "doubt_of", "hiding_px"]
+__all__ = ["OF_OTHER", "blurred_in_doubt", "contradicted", "doubt_of", "hiding_px"]
+
+OF_OTHER = 1.5
+"""Part of the other side's share that is taken off a side's; larger: only maps that err clearly on one side."""
 
 _CONTRADICTED = 0.03  # share of clear pixels that contradict the map, on either side, from which it is in doubt
 _OFTEN_CONTRADICTED = 0.045  # the same from which it is fully in doubt
 _ASSUMED = 15.0  # pixels that are assumed to agree with the map; larger: maps with few edges are trusted
-_OF_FAR = 1.5  # part of the far side's share that is taken off the near side's; larger: only clearly wide foregrounds
 _DILATED = 0.05  # rest of the near side's share from which foregrounds are too wide
 _MUCH_DILATED = 0.15  # the same from which they fully count as too wide
-_BEYOND_NEAR, _BEYOND_FAR = 0.3, 0.06  # shares of both sides above which dilated ones are so beyond the repair's reach
 _MOVED_PX = 1.0  # px; change of the coc by which the repair of edges has half moved a pixel
 _REACH = 8  # px; distance from a blurred foreground at which its blur has faded; larger: fewer scraps, softer pictures
 _NEAR_FROM, _NEAR_SLOPE = 0.375, 4.0  # blur, over the largest around, above which a pixel is near; slope of this weight
@@ -49,6 +50,12 @@ def hiding_px(blur_px: Tensor) -> Tensor:
     return (blur_px + _APART_PX) * (1.0 / _SHARPER)
 
 
+def contradicted(clear: Tensor, agreed: Tensor) -> tuple[Tensor, Tensor]:
+    """Shares of the clear pixels of near and far surfaces that contradict a map; arguments as for :func:`doubt_of`."""
+    near, far = ((clear - agreed) / (clear + _ASSUMED)).unbind(0)
+    return near, far
+
+
 def doubt_of(clear: Tensor, agreed: Tensor) -> tuple[Tensor, Tensor]:
     """How much a map is in doubt, and how far its foregrounds are dilated.
 
@@ -57,17 +64,15 @@ def doubt_of(clear: Tensor, agreed: Tensor) -> tuple[Tensor, Tensor]:
         agreed: Those of pixels that have the colour of the surface that the map gives them.
 
     Returns:
-        ``[...]`` each. The doubt, 0 to 1: the less contradicted side counts, because colours of a map that is only
-        too thin, or too wide, contradict it on one side, and the repair of edges cures that. And how far foregrounds
-        are dilated, too wide, 0 to 1, or 2 beyond the reach of the repair: the near side is contradicted much more than
-        the far one. Beyond that reach some far pixels contradict the map too, because near colours are not found.
+        ``[...]`` each, 0 to 1. The doubt: the less contradicted side counts, because colours of a map that is only too
+        thin, or too wide, contradict it on one side, and the repair of edges cures that. And how far foregrounds are
+        dilated, too wide: the near side is contradicted much more than the far one.
     """
-    near, far = ((clear - agreed) / (clear + _ASSUMED)).unbind(0)
+    near, far = contradicted(clear, agreed)
     doubt = (torch.minimum(near, far) - _CONTRADICTED) / (_OFTEN_CONTRADICTED - _CONTRADICTED)
-    dilated = ((near - _OF_FAR * far - _DILATED) / (_MUCH_DILATED - _DILATED)).clamp(0.0, 1.0)
-    is_beyond = (near > _BEYOND_NEAR) & (near > _OF_FAR * far) & (far > _BEYOND_FAR)
-    dilated = torch.where(is_beyond, 2.0, dilated)
-    return doubt.clamp(0.0, 1.0) * (1.0 - dilated).clamp_min(0.0), dilated
+    dilated = (near - OF_OTHER * far - _DILATED) / (_MUCH_DILATED - _DILATED)
+    dilated = dilated.clamp(0.0, 1.0)
+    return doubt.clamp(0.0, 1.0) * (1.0 - dilated), dilated
 
 
 def blurred_in_doubt(given: Tensor, repaired: Tensor, unlike: Tensor, doubt: Tensor, ops: Ops = EAGER) -> Tensor:

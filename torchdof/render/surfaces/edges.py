@@ -12,7 +12,6 @@ estimation turn an edge into averages of it.
 """
 
 import functools
-from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -45,8 +44,9 @@ from .edge_colours import (
 from .edge_prior import PRIOR_COUNT, weight_of
 from .edge_search import REACH, RINGS, Edges
 from .missed import completed
+from .resizing import Repaired, from_resized, resizing_of
 from .soft_maps import Softness, lift_lamps, sigma_of, without_ringing
-from .windows import LARGEST, NEVER, highest
+from .windows import LARGEST, highest
 
 __all__ = ["STEP_PX", "judged", "mended", "repair", "repair_edges"]
 
@@ -78,7 +78,6 @@ _SOFT = 0.32  # sum of :func:`_mixture` on ramps, per pixel of edge; with means 
 _WIDE = 13.0  # this sum over _SOFT; maps of a quarter of the resolution have up to 12, of an eighth 15 to 20
 _HALVINGS = 2  # most halvings of a map with wider ramps
 
-_MOST_ERODED_PX = 6  # px; by which foregrounds are eroded at most before a repair
 _MISSES_NOTHING = 0.5  # how far foregrounds are dilated from which they never grow
 
 # With a matte
@@ -192,50 +191,13 @@ def repair(
 
     Returns:
         ``[B, 1, H, W]``, constant to autograd; unchanged pixels keep their values to the bit. ``nearness`` itself if
-        the compiled engine leaves all of it unchanged. And how much the map is in doubt, 0 to 1, less how far its
-        foregrounds are dilated, 0 to 2, ``[B, 1, 1, 1]``, both of :func:`.doubt.doubt_of`.
+        the compiled engine leaves all of it unchanged. And how much the map, resized, is in doubt, 0 to 1, less how far
+        its foregrounds are dilated, 0 to 1, ``[B, 1, 1, 1]``, both of :func:`.doubt.doubt_of`.
     """
     device = image.device.type
     if torch.is_autocast_enabled(device):  # which would compute in half precision
         with torch.autocast(device, enabled=False):
             return repair(image, nearness, step, auto, of_coc, ops, halvings)
-    once = functools.partial(_repaired, image, step=step, auto=auto, of_coc=of_coc, ops=ops, halvings=halvings)
-    # in graphs this would multiply the time of their export; the operator of compiled code does it itself
-    return once(nearness) if is_traced() else _from_eroded(once, nearness, of_coc)
-
-
-def _from_eroded(
-    once: Callable[[Tensor], tuple[Tensor, Tensor]], nearness: Tensor, of_coc: bool
-) -> tuple[Tensor, Tensor]:
-    """Repairs a map, whose foregrounds are first eroded if they are dilated beyond the reach of a repair.
-
-    ``once`` repairs a map as :func:`repair`; only dilation beyond its reach makes the doubt less than -1. The returned
-    doubt is that of the given map, whose foregrounds miss nothing.
-    """
-    repaired, doubt = once(nearness)
-    latest = doubt
-    for _ in range(_MOST_ERODED_PX):
-        is_wide = latest < -1.0
-        if not is_wide.any():
-            break
-        nearness = torch.where(is_wide, _eroded(nearness, of_coc), nearness)
-        again, latest = once(nearness)
-        repaired = torch.where(is_wide, again, repaired)
-    return repaired, doubt
-
-
-def _eroded(nearness: Tensor, of_coc: bool) -> Tensor:
-    """A map whose near surfaces are narrower by a pixel on each side. Invalid values stay."""
-    wide, sign = nearness.to(torch.promote_types(nearness.dtype, torch.float32)), -1.0 if of_coc else 1.0
-    valid = wide.abs() <= LARGEST
-    far = highest(torch.where(valid, -sign * wide, -NEVER), 1)
-    return torch.where(valid, (-sign * far).to(nearness.dtype), nearness)
-
-
-def _repaired(
-    image: Tensor, nearness: Tensor, step: Tensor | float, auto: bool, of_coc: bool, ops: Ops, halvings: int
-) -> tuple[Tensor, Tensor]:
-    """:func:`repair` of one map, by one of the engines."""
     image = image.detach()
     light, given = image.float(), nearness.float().expand(image.shape[0], -1, -1, -1)
     step = torch.as_tensor(step, dtype=given.dtype, device=given.device)
@@ -247,8 +209,10 @@ def _repaired(
         repaired, doubt = by_items(repair_item, given, light, steps[:, 0])
         if repaired is given:
             return nearness, doubt
+    elif is_traced():  # resizing would multiply the time of the export
+        repaired, doubt, _ = _repair(light, given, step, auto, of_coc, ops)
     else:
-        repaired, doubt = _repair(light, given, step, auto, of_coc, ops, halvings)
+        repaired, doubt = _resized_and_repaired(light, given, step, auto, of_coc, ops, halvings)
     if nearness.dtype == torch.float32:
         return repaired, doubt
     return torch.where(repaired == given, nearness, repaired.to(nearness.dtype)), doubt
@@ -258,12 +222,20 @@ def _repair_item(
     light: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool, halvings: int
 ) -> tuple[Tensor, float]:
     """:func:`repair` by the compiled engine, for one item: ``[C, H, W]``, ``[H, W]``, and ``[H, W]`` or ``[]``."""
-    repaired, doubt, is_wide = native.repair_edges(light, nearness, step, auto, of_coc, stops_if_wide=halvings > 0)
-    if is_wide:
-        given = light[None], nearness[None, None], step[None, None]
-        narrow, is_related = _narrowed(*given, auto, of_coc, halvings)
-        repaired, doubt, _ = native.repair_edges(light, narrow[0, 0], step, auto, of_coc, is_related=bool(is_related))
-    return repaired, doubt
+
+    def once(given: Tensor, may_resize: bool) -> Repaired:
+        repair = functools.partial(native.repair_edges, light, stops_to_resize=may_resize)
+        flat = given[0, 0]
+        repaired, doubt, is_wide, asked = repair(flat, step, auto, of_coc, stops_if_wide=halvings > 0)
+        if is_wide:
+            narrow, is_related = _narrowed(light[None], given, step[None, None], auto, of_coc, halvings)
+            repaired, doubt, _, asked = repair(narrow[0, 0], step, auto, of_coc, is_related=bool(is_related))
+        numbers = given.new_tensor([[doubt], [asked]])[..., None, None]
+        return given if repaired is flat else repaired[None, None], *numbers
+
+    given = nearness[None, None]
+    repaired, doubt = from_resized(once, given, -1.0 if of_coc else 1.0)
+    return nearness if repaired is given else repaired[0, 0], float(doubt)
 
 
 def _narrowed(
@@ -306,6 +278,23 @@ def judged(image: Tensor, coc_px: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     nearness = -coc_px.float().expand(image.shape[0], -1, -1, -1)
     edges = _Map.of(image, nearness, nearness.new_tensor(STEP_PX), True).edges
     return edges.is_edge, edges.is_edge & edges.is_ramp, mended(image, coc_px, "auto")
+
+
+def _resized_and_repaired(
+    image: Tensor,
+    nearness: Tensor,
+    step: Tensor,
+    auto: bool,
+    of_coc: bool,
+    ops: Ops = EAGER,
+    halvings: int = _HALVINGS,
+) -> tuple[Tensor, Tensor]:
+    """:func:`repair` by PyTorch."""
+
+    def once(nearness: Tensor, _: bool) -> Repaired:
+        return _repair(image, nearness, step, auto, of_coc, ops, halvings)
+
+    return from_resized(once, nearness, -1.0 if of_coc else 1.0)
 
 
 class _Map(NamedTuple):
@@ -382,7 +371,8 @@ class _Errors(NamedTuple):
     prior: Tensor  # share of the pixels of each one's kind that show the near surface, [B, 1, H, W]
     doubtful: Tensor  # edge pixels that are decided, [B, 1, H, W]
     doubt: Tensor  # 0 to 1, how much the image contradicts the map, [B, 1, 1, 1]
-    dilated: Tensor  # 0 to 2, how far the map's foregrounds are too wide, [B, 1, 1, 1]
+    dilated: Tensor  # 0 to 1, how far the map's foregrounds are too wide, [B, 1, 1, 1]
+    resizing: Tensor  # -1, 0 or 1, of :func:`.resizing.resizing_of`, [B, 1, 1, 1]
 
 
 @torch.no_grad()
@@ -394,8 +384,8 @@ def _repair(
     of_coc: bool = False,
     ops: Ops = EAGER,
     halvings: int = _HALVINGS,
-) -> tuple[Tensor, Tensor]:
-    """Plain PyTorch version of :func:`repair`.
+) -> Repaired:
+    """One repair of a map as it is.
 
     1. Find ramps and steps, and the nearness of both surfaces there; narrow the ramps of a map where they are too wide.
     2. From a sample of the edge pixels, detect soft maps, score the pixels by colour, and fit the prior of each kind of
@@ -416,7 +406,7 @@ def _repair(
     errors = _errors_of(scene, sample, auto, is_related, ops)
     chosen = pixels.indices(errors.doubtful)
     if auto and is_empty(chosen):  # nor lamps: a soft map has ramps, which are selected
-        return nearness, torch.zeros_like(errors.doubt)
+        return nearness, torch.zeros_like(errors.doubt), errors.resizing
     shown = judge(scene.looks, scene.nearness, chosen, errors.sharpness, False, of_coc, ops)
     shows_near = _decided(scene, errors, shown.score, chosen, auto)
     repaired = _moved(scene, errors, shown, shows_near, chosen)
@@ -429,7 +419,7 @@ def _repair(
         soft = Softness(errors.is_soft, sigma_of(scene.edges), lost / length, errors.doubt)
         repaired = lift_lamps(scene.light, scene.nearness, repaired, scene.step, soft, ops)
     repaired = torch.where(scene.valid, repaired, signed)
-    return -repaired if of_coc else repaired, errors.doubt - errors.dilated
+    return -repaired if of_coc else repaired, errors.doubt - errors.dilated, errors.resizing
 
 
 def _errors_of(scene: _Map, sample: _Sample, auto: bool, is_related: Tensor, ops: Ops) -> _Errors:
@@ -440,10 +430,11 @@ def _errors_of(scene: _Map, sample: _Sample, auto: bool, is_related: Tensor, ops
 
     kind = edge_search.kinds(edges)
     score = judge(scene.looks, scene.nearness, sampled, sharpness, True, False, ops).score
-    prior = calibrate(scene.light, pixels.pick(kind, sampled)[0], score)[kind]
+    shares = calibrate(scene.light, pixels.pick(kind, sampled)[0], score)
+    prior = shares[kind]
     doubt = scene.nearness.new_zeros(scene.nearness.shape[0], 1, 1, 1)
     if not auto:
-        return _Errors(is_soft, sharpness, prior, edges.is_edge, doubt, doubt)
+        return _Errors(is_soft, sharpness, prior, edges.is_edge, doubt, doubt, doubt)
 
     # colour agrees with the map at clear pixels: in the outermost ring of a step, or near a ramp's ends; on one side of
     # the edges only where the map's foreground is too thin, and at half of them where it has no relation
@@ -455,6 +446,10 @@ def _errors_of(scene: _Map, sample: _Sample, auto: bool, is_related: Tensor, ops
     clear, agreed = torch.stack(sides).chunk(2)
     assumed = 0.5 * PRIOR_COUNT  # pixels, half of which agree
     is_related = is_related | (agreed + 0.5 * assumed > _RELATED * (clear + assumed)).any(0)
+    resizing = doubt
+    if active().resizing and not is_traced():
+        resizing = resizing_of(clear, agreed, shares, is_soft)
+        is_related = is_related | (resizing != 0)
     is_soft = is_soft & is_related
     is_inexact = is_related & (is_soft | (doubts > _EXACT * steps))
     doubtful = edges.is_edge & is_inexact & torch.where(edges.is_ramp, is_soft, wrong > _DOUBTFUL)
@@ -464,7 +459,7 @@ def _errors_of(scene: _Map, sample: _Sample, auto: bool, is_related: Tensor, ops
         faded = in_doubt * (softness - 1.0).clamp(0.0, 1.0)
         doubt = torch.where(is_soft, faded.to(dtype), doubt)
     dilated = dilated.to(dtype) if active().dilated else torch.zeros_like(doubt)
-    return _Errors(is_soft, sharpness, prior, doubtful, doubt, dilated)
+    return _Errors(is_soft, sharpness, prior, doubtful, doubt, dilated, resizing)
 
 
 def _decided(scene: _Map, errors: _Errors, score: Tensor, chosen: Tensor, auto: bool) -> Tensor:
@@ -476,7 +471,7 @@ def _decided(scene: _Map, errors: _Errors, score: Tensor, chosen: Tensor, auto: 
     something: the foregrounds would stay too wide.
     """
     rules, of_soft = active(), scene.of_item(errors.is_soft, chosen)
-    dilated = scene.of_item(errors.dilated, chosen).clamp(max=1.0)
+    dilated = scene.of_item(errors.dilated, chosen)
     odds = score + torch.logit(pixels.pick(errors.prior, chosen)[0])
     if auto and rules.far_lead:  # without auto, correct steps are decided too, and the lead would move them
         odds = odds + (1.0 - dilated) * _LEAN * (score.abs() - 1.0).clamp(0.0, 1.0)
@@ -531,6 +526,5 @@ def _empty(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bo
 # The number of pixels to process depends on the data, which compiled graphs do not support.
 @one_operator("torchdof::repair_edges", _empty)
 def _operator(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool) -> tuple[Tensor, Tensor]:
-    once = functools.partial(_repair, image, step=step, auto=auto, of_coc=of_coc)
-    repaired, doubt = _from_eroded(once, nearness, of_coc)
+    repaired, doubt = _resized_and_repaired(image, nearness, step, auto, of_coc)
     return repaired.clone(), doubt
