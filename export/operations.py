@@ -20,7 +20,7 @@ from torchdof.render.surfaces.disocclusion import counted_behind, is_another_sur
 from torchdof.render.surfaces.frame import Highlights, PaddedFrame, PaddedSurface
 
 from .rays import kernels_of, splat
-from .structure import choose, collect, operator, steps
+from .structure import carried, choose, collect, last, operator, steps
 
 __all__ = ["GraphOps", "WholeOps"]
 
@@ -46,6 +46,18 @@ class GraphOps(Ops):
     def equal_unless(self, needed: Callable[[], Tensor], result: Tensor, given: Tensor) -> Tensor:
         """A branch."""
         return choose(needed(), result, given)
+
+    def repeated(
+        self,
+        step: Callable[[Sequence[Tensor], bool], tuple[Sequence[Tensor], Tensor]],
+        state: Sequence[Tensor],
+        times: int,
+    ) -> Sequence[Tensor]:
+        """A loop that ends early."""
+        number = steps(times)
+        before = carried(number, _packed(state))
+        after, goes_on = step(_unpacked(before, state), False)
+        return _unpacked(last(number, before, _packed(after), goes_on), state)
 
     def by_parts(self, look: Callable[[Tensor], Tensor], pixels: Tensor) -> Tensor:
         """A loop over parts of the list, because each pixel has many neighbours."""
@@ -126,6 +138,17 @@ class GraphOps(Ops):
             sharp = torch.cat([sharp, torch.ones_like(sharp[:, :weights])], 1)
         is_blurred = torch.stack([s.x.abs().max() for s in surfaces]).max() > 0
         return tiles.joined(choose(is_blurred, rendered, sharp))[..., : frame.size[0], : frame.size[1]]
+
+
+def _packed(state: Sequence[Tensor]) -> Tensor:
+    """Maps ``[B, 1, H, W]``, the first one of all, and numbers ``[B, 1, 1, 1]`` as one tensor."""
+    return torch.cat([part.expand_as(state[0]) for part in state], 1)
+
+
+def _unpacked(packed: Tensor, like: Sequence[Tensor]) -> list[Tensor]:
+    """Maps and numbers of the same sizes as others."""
+    parts = zip(packed.split(1, 1), like, strict=True)
+    return [part.narrow(2, 0, size.shape[2]).narrow(3, 0, size.shape[3]) for part, size in parts]
 
 
 def _counts(area: Sequence[int], size: tuple[int, int]) -> tuple[list[int], list[int]]:

@@ -18,7 +18,7 @@ __all__ = ["carried", "choose", "collect", "last", "operator", "steps", "structu
 
 _CHOICE, _STEP, _COLLECT, _CARRIED, _LAST = (f"torchdof::{n}" for n in ("Choice", "Step", "Collect", "Carried", "Last"))
 """``Choice(result, given, needed)``; ``Step(count)``, the number of a step from 0; ``Collect(result, step)``;
-``Carried(initial, step)``; ``Last(after, step, carried)``. A finished file contains none of them."""
+``Carried(initial, step)``; ``Last(after, step, carried[, goes_on])``. A finished file contains none of them."""
 
 
 def choose(needed: Tensor, result: Tensor, given: Tensor) -> Tensor:
@@ -41,9 +41,12 @@ def carried(step: Tensor, initial: Tensor) -> Tensor:
     return operator(_CARRIED, [initial, step], initial.shape)
 
 
-def last(step: Tensor, before: Tensor, after: Tensor) -> Tensor:
-    """The value after all steps, each of which makes ``after`` of ``before``, a value of :func:`carried`."""
-    return operator(_LAST, [after, step, before], after.shape)
+def last(step: Tensor, before: Tensor, after: Tensor, goes_on: Tensor | None = None) -> Tensor:
+    """The value after the last step, each of which makes ``after`` of ``before``, a value of :func:`carried`.
+
+    The loop ends early after a step in which ``goes_on``, a bool ``[]``, is false.
+    """
+    return operator(_LAST, [after, step, before, *([] if goes_on is None else [goes_on])], after.shape)
 
 
 def operator(name: str, inputs: Sequence[Tensor], shape: Sequence[int | torch.SymInt]) -> Tensor:
@@ -65,11 +68,11 @@ def _ours(graph: onnx_ir.Graph, name: str) -> list[onnx_ir.Node]:
 def _loop(graph: onnx_ir.Graph, end: onnx_ir.Node) -> None:
     """Moves the nodes between a step and ``end``, which takes its result, into the body of a loop."""
     inputs: list[Any] = list(end.inputs)
-    result, step, *carried = inputs
+    result, step, *carried = inputs[:3]
     starts = [value.producer() for value in (step, *carried)]
     dependent, body_nodes = set(starts[:1]), []
     for node in graph:
-        if node is not end and any(v is not None and v.producer() in dependent for v in node.inputs):
+        if node is not end and any(v is not None and v.producer() in dependent for v in _used_values(node)):
             dependent.add(node)
             if node not in starts:
                 body_nodes.append(node)
@@ -80,7 +83,7 @@ def _loop(graph: onnx_ir.Graph, end: onnx_ir.Node) -> None:
     for old, new in zip((step, *carried), (number, *befores), strict=True):
         old.replace_all_uses_with(new)
     inner, outer = Tape(), Tape()
-    condition = inner.op("Identity", [keep_going])
+    condition = inner.op("Identity", inputs[3:] or [keep_going])
     condition.dtype, condition.shape = onnx_ir.DataType.BOOL, onnx_ir.Shape([])
     axis = inner.op("Constant", [], {"value_ints": [0]})
     after = inner.op("Identity", [result]) if carried else inner.op("Squeeze", [result, axis])

@@ -106,7 +106,7 @@ def test_layers_with_gradients_are_those_of_each_item() -> None:
 
 @pytest.mark.parametrize("occlusion", [True, False])
 def test_a_batch_takes_hardly_more_operations_than_its_most_expensive_item(occlusion: bool) -> None:
-    images, cocs = batch(0, (2.0, 12.0, 30.0, 7.0))
+    images, cocs = batch(1, (2.0, 12.0, 30.0, 7.0))
 
     def operations(images: Tensor, cocs: Tensor) -> int:
         blur_by_coc(images, cocs, occlusion=occlusion)  # some tensors are made once

@@ -79,7 +79,7 @@ def test_a_dilated_foreground_is_narrowed_and_does_not_grow(engine: str, spread:
 
 def test_a_map_that_misses_parts_is_in_doubt(engine: str) -> None:
     """Colours do not contradict it, but its hair is longer than it can grow."""
-    image, given, _ = furry_post(noise=0.3)
+    image, given, _ = furry_post(noise=0.1)
     assert float(edges.repair(image, given, edges.STEP_PX, True, True)[1]) == 0.0
     coc = mended(image, given)
     with without(["in_doubt"]):

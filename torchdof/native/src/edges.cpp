@@ -256,7 +256,8 @@ class Repair : Planes, EdgeMap {
           lowest[side] = std::min(lowest[side], wrong);
           highest[side] = std::max(highest[side], wrong);
         }
-      is_thin = is_thin || (lowest[0] > ALL_SIDES && highest[1] < OTHER_SIDE);
+      is_thin =
+          (is_thin && lowest[0] > constants::resizing::BESIDE) || (lowest[0] > ALL_SIDES && highest[1] < OTHER_SIDE);
       is_wide = is_wide || (lowest[1] > ALL_SIDES && highest[0] < OTHER_SIDE);
     }
     return is_thin - is_wide;

@@ -63,6 +63,22 @@ class Ops:
         """
         return result
 
+    def repeated(
+        self,
+        step: Callable[[Sequence[Tensor], bool], tuple[Sequence[Tensor], Tensor]],
+        state: Sequence[Tensor],
+        times: int,
+    ) -> Sequence[Tensor]:
+        """Applies ``step`` to maps ``[B, 1, H, W]`` and numbers ``[B, 1, 1, 1]``, at most a number of ``times``.
+
+        It gives the next state, and whether to go on, a bool ``[]``; it is told whether this is possible.
+        """
+        for left in reversed(range(1 if is_traced() else times)):  # what is traced cannot read values
+            state, goes_on = step(state, left > 0)
+            if not left or not goes_on:
+                break
+        return state
+
     def by_parts(self, look: Callable[[Tensor], Tensor], pixels: Tensor) -> Tensor:
         """Computes ``look(pixels)``, ``[n, P]``, for pixels ``[P]``, in parts of the list to bound the memory."""
         return look(pixels) if is_traced() else torch.cat([look(part) for part in pixels.split(_PART)], 1)

@@ -209,8 +209,6 @@ def repair(
         repaired, doubt = by_items(repair_item, given, light, steps[:, 0])
         if repaired is given:
             return nearness, doubt
-    elif is_traced():  # resizing would multiply the time of the export
-        repaired, doubt, _ = _repair(light, given, step, auto, of_coc, ops)
     else:
         repaired, doubt = _resized_and_repaired(light, given, step, auto, of_coc, ops, halvings)
     if nearness.dtype == torch.float32:
@@ -294,7 +292,7 @@ def _resized_and_repaired(
     def once(nearness: Tensor, _: bool) -> Repaired:
         return _repair(image, nearness, step, auto, of_coc, ops, halvings)
 
-    return from_resized(once, nearness, -1.0 if of_coc else 1.0)
+    return from_resized(once, nearness, -1.0 if of_coc else 1.0, ops)
 
 
 class _Map(NamedTuple):
@@ -447,8 +445,8 @@ def _errors_of(scene: _Map, sample: _Sample, auto: bool, is_related: Tensor, ops
     assumed = 0.5 * PRIOR_COUNT  # pixels, half of which agree
     is_related = is_related | (agreed + 0.5 * assumed > _RELATED * (clear + assumed)).any(0)
     resizing = doubt
-    if active().resizing and not is_traced():
-        resizing = resizing_of(clear, agreed, shares, is_soft)
+    if active().resizing:
+        resizing = resizing_of(clear, agreed, shares, is_soft).to(dtype)
         is_related = is_related | (resizing != 0)
     is_soft = is_soft & is_related
     is_inexact = is_related & (is_soft | (doubts > _EXACT * steps))

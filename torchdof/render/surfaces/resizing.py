@@ -6,11 +6,12 @@ foreground beside the steps of a hard map, at the clearest pixels of a soft one.
 at a time as long as colours ask for it. The repair that follows has smaller errors to correct.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
+from ..engines.ops import EAGER, Ops
 from .doubt import OF_OTHER, contradicted
 from .edge_search import DIRECTIONS, PLACES, RINGS
 from .windows import LARGEST, NEVER, highest
@@ -22,8 +23,10 @@ _ALL_SIDES = (
 )
 _OTHER_SIDE = 0.25  # largest share of wrong pixels on the other side of these steps
 _THIN = 0.4  # share of clear pixels of the far side that contradict a map, from which its foregrounds are too thin
+_BESIDE = 0.2  # the same share beside the steps of a hard map, in each direction
 _WIDE, _WIDE_FAR = 0.3, 0.06  # those of near and far side above which they are too wide for the repair
 _MOST_PX = 6  # px; by which foregrounds are resized at most
+_UNASKED = 2.0  # stands for what a map asks before its first repair
 
 Repaired = tuple[Tensor, Tensor, Tensor]
 """A repaired map ``[B, 1, H, W]``, its doubt, and what :func:`resizing_of` says of the map it is repaired from."""
@@ -48,34 +51,42 @@ def resizing_of(clear: Tensor, agreed: Tensor, prior: Tensor, is_soft: Tensor) -
 
     beside = prior.view(-1, PLACES, DIRECTIONS)[..., None, None]
     far_wrong, near_wrong = beside[:, :1], 1.0 - beside[:, RINGS : RINGS + 1]
-    lowest = [wrong.amin(2) > _ALL_SIDES for wrong in (far_wrong, near_wrong)]
-    trusted = [wrong.amax(2) < _OTHER_SIDE for wrong in (far_wrong, near_wrong)]
-    is_thin = is_thin | (~is_soft & lowest[0] & trusted[1])
-    is_wide = is_wide | (~is_soft & lowest[1] & trusted[0])
+    least_far, least_near = far_wrong.amin(2), near_wrong.amin(2)
+    is_thin = is_thin & (is_soft | (least_far > _BESIDE))  # not hair alone
+    is_thin = is_thin | (~is_soft & (least_far > _ALL_SIDES) & (near_wrong.amax(2) < _OTHER_SIDE))
+    is_wide = is_wide | (~is_soft & (least_near > _ALL_SIDES) & (far_wrong.amax(2) < _OTHER_SIDE))
     return is_thin.to(near.dtype) - is_wide.to(near.dtype)
 
 
-def from_resized(once: Callable[[Tensor, bool], Repaired], nearness: Tensor, sign: float) -> tuple[Tensor, Tensor]:
+def from_resized(
+    once: Callable[[Tensor, bool], Repaired], nearness: Tensor, sign: float, ops: Ops = EAGER
+) -> tuple[Tensor, Tensor]:
     """Repairs a map whose foregrounds are first dilated or eroded, if colours ask for it.
 
     Args:
-        once: Repairs a map. Where it is resized again, the bool is true, and only the third result counts.
+        once: Repairs a map. If the bool is true and it asks for resizing, only its third result counts.
         nearness: The map, ``[B, 1, H, W]``.
         sign: -1 if a smaller value is nearer, else 1.
+        ops: Repeats the repair.
 
     Returns:
         The repaired map, and the doubt in the map from which it is repaired.
     """
-    repaired, doubt, asked = once(nearness, True)
-    resizing = asked
-    for left in reversed(range(_MOST_PX)):
-        resizing = torch.where(asked == resizing, resizing, 0.0)  # never back
-        if not resizing.any():
-            break
+
+    def step(state: Sequence[Tensor], may_resize: bool) -> tuple[Sequence[Tensor], Tensor]:
+        before, repaired, doubt, resizing = state
+        resized = before
         for by in (-1.0, 1.0):
-            nearness = torch.where(resizing == by, _resized(nearness, by * sign), nearness)
-        again, its_doubt, asked = once(nearness, left > 0)
-        repaired, doubt = (torch.where(resizing != 0, *t) for t in ((again, repaired), (its_doubt, doubt)))
+            resized = torch.where(resizing == by, _resized(before, by * sign), resized)
+        again, its_doubt, asked = once(resized, may_resize)
+        is_new = resizing != 0
+        repaired, doubt = torch.where(is_new, again, repaired), torch.where(is_new, its_doubt, doubt)
+        goes_on = (resizing == asked) | (resizing == _UNASKED)  # never back
+        resizing = torch.where(goes_on, asked, 0.0)
+        return (resized, repaired, doubt, resizing), (resizing != 0).any()
+
+    unasked = nearness.new_full((nearness.shape[0], 1, 1, 1), _UNASKED)
+    _, repaired, doubt, _ = ops.repeated(step, (nearness, nearness, unasked, unasked), _MOST_PX + 1)
     return repaired, doubt
 
 
