@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.scenes import furry_post, wavy_post
+from tests.scenes import furry_post, resized_post, wavy_post
 from torchdof import Camera, blur_by_coc
 from torchdof.export import describe
 from torchdof.export.verification import TOLERANCE, local_range, session
@@ -88,6 +88,21 @@ def test_a_file_without_edges_to_repair_is_bit_exact_in_focus(
     image = tensors[0]
     got = runner.run(None, {"image": image.numpy(), "coc_px": np.zeros_like(tensors[1])})[0]
     assert np.array_equal(got, image.numpy())
+
+
+@pytest.mark.parametrize(("by_px", "widths"), [(-3, []), (3, []), (-4, [5, 5]), (5, [5, 5]), (0, [])])
+def test_a_file_resizes_foregrounds_that_are_too_thin_or_too_wide(
+    runner: onnxruntime.InferenceSession, monkeypatch: pytest.MonkeyPatch, by_px: int, widths: list[int]
+) -> None:
+    """In a loop, whose number of steps depends on the frame; beside it another item that needs none."""
+    monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
+    image, coc, exact = resized_post(0.1, by_px, widths)
+    image, coc = image[:, :1].repeat(2, 1, 1, 1), torch.cat([coc, exact]) / 6.0
+    expected = rendered(image, coc, "auto")
+    with without(["resizing"]):
+        assert (float((expected - rendered(image, coc, "auto")).abs().max()) > 0.05) == (by_px != 0)
+    got = runner.run(None, {"image": image.numpy(), "coc_px": coc.numpy()})[0]
+    assert error(got, expected, image) <= TOLERANCE
 
 
 @pytest.mark.parametrize(("scene", "rule"), [(furry_post, "missed_parts"), (wavy_post, "in_doubt")])

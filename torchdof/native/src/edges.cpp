@@ -101,8 +101,8 @@ class Repair : Planes, EdgeMap {
     else
       choose_edges(groups, [&](const Edge &edge) { return doubtful[given_kind_of(edge)]; });
     judge_edges(*this, groups, true, sharpness);
-    const auto [in_doubt, dilated] = map_.automatic ? doubt_of(agreement) : Doubt{};
-    const float faded = is_soft ? in_doubt * clamp01((float)softness - 1.0f) : 0.0f;
+    const auto [in_doubt, dilated] = map_.automatic && is_soft ? doubt_of(agreement) : Doubt{};
+    const float faded = in_doubt * clamp01((float)softness - 1.0f);
     const float lost_px = move(groups, is_soft, faded, dilated);
     if (is_soft) remove_ringing(*this);
     if (is_soft && faded < 1) lift_lamps(*this, sigma_of(found_), lost_px, faded);

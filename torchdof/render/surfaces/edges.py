@@ -192,7 +192,7 @@ def repair(
     Returns:
         ``[B, 1, H, W]``, constant to autograd; unchanged pixels keep their values to the bit. ``nearness`` itself if
         the compiled engine leaves all of it unchanged. And how much the map, resized, is in doubt, 0 to 1, less how far
-        its foregrounds are dilated, 0 to 1, ``[B, 1, 1, 1]``, both of :func:`.doubt.doubt_of`.
+        its foregrounds are dilated, 0 to 1, ``[B, 1, 1, 1]``, both of :func:`.doubt.doubt_of`, in soft maps.
     """
     device = image.device.type
     if torch.is_autocast_enabled(device):  # which would compute in half precision
@@ -369,7 +369,7 @@ class _Errors(NamedTuple):
     prior: Tensor  # share of the pixels of each one's kind that show the near surface, [B, 1, H, W]
     doubtful: Tensor  # edge pixels that are decided, [B, 1, H, W]
     doubt: Tensor  # 0 to 1, how much the image contradicts the map, [B, 1, 1, 1]
-    dilated: Tensor  # 0 to 1, how far the map's foregrounds are too wide, [B, 1, 1, 1]
+    dilated: Tensor  # 0 to 1, how far a soft map's foregrounds are too wide, [B, 1, 1, 1]
     resizing: Tensor  # -1, 0 or 1, of :func:`.resizing.resizing_of`, [B, 1, 1, 1]
 
 
@@ -451,12 +451,13 @@ def _errors_of(scene: _Map, sample: _Sample, auto: bool, is_related: Tensor, ops
     is_soft = is_soft & is_related
     is_inexact = is_related & (is_soft | (doubts > _EXACT * steps))
     doubtful = edges.is_edge & is_inexact & torch.where(edges.is_ramp, is_soft, wrong > _DOUBTFUL)
-    in_doubt, dilated = doubt_of(clear, agreed)
-    if active().in_doubt:
-        # ramps of a pixel are means over pixels, or artefacts of compression: there is little to doubt
-        faded = in_doubt * (softness - 1.0).clamp(0.0, 1.0)
-        doubt = torch.where(is_soft, faded.to(dtype), doubt)
-    dilated = dilated.to(dtype) if active().dilated else torch.zeros_like(doubt)
+    in_doubt, dilated = (torch.where(is_soft, found, 0.0) for found in doubt_of(clear, agreed))
+    # ramps of a pixel are means over pixels, or artefacts of compression: there is little to doubt
+    faded = in_doubt * (softness - 1.0).clamp(0.0, 1.0)
+    doubt, dilated = (
+        found.to(dtype) if applies else doubt
+        for found, applies in ((faded, active().in_doubt), (dilated, active().dilated))
+    )
     return _Errors(is_soft, sharpness, prior, doubtful, doubt, dilated, resizing)
 
 

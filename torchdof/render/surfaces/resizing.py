@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from ...tensors import is_traced
 from ..engines.ops import EAGER, Ops
 from .doubt import OF_OTHER, contradicted
 from .edge_search import DIRECTIONS, PLACES, RINGS
@@ -85,8 +86,14 @@ def from_resized(
         resizing = torch.where(goes_on, asked, 0.0)
         return (resized, repaired, doubt, resizing), (resizing != 0).any()
 
-    unasked = nearness.new_full((nearness.shape[0], 1, 1, 1), _UNASKED)
-    _, repaired, doubt, _ = ops.repeated(step, (nearness, nearness, unasked, unasked), _MOST_PX + 1)
+    if is_traced():
+        unasked = nearness.new_full((nearness.shape[0], 1, 1, 1), _UNASKED)
+        state, times = (nearness, nearness, unasked, unasked), _MOST_PX + 1
+    else:
+        state, times = (nearness, *once(nearness, True)), _MOST_PX
+        if not state[-1].any():
+            return state[1:3]
+    _, repaired, doubt, _ = ops.repeated(step, state, times)
     return repaired, doubt
 
 
