@@ -408,15 +408,15 @@ def repair_edges(
     of_coc: bool = False,
     stops_if_wide: bool = False,
     is_related: bool = False,
-    stops_to_resize: bool = False,
+    stops_to_resize: int = 0,
 ) -> tuple[Tensor, float, bool, int]:
     """Repairs the edges of a depth map, as :func:`torchdof.render.surfaces.edges.repair`, for one image.
 
     ``light`` is ``[C, H, W]``, ``nearness`` ``[H, W]``, ``step`` ``[H, W]`` or ``[]``. The results are the map, the
     input itself if it needs no repair, how much it is in doubt, 0 to 1, less how far its foregrounds are dilated, 0 to
     1, whether the repair has stopped because of ramps too wide to be found, with ``stops_if_wide``, and whether
-    foregrounds are too thin, 1, or too wide, -1; ``stops_to_resize`` then leaves the map as it is. ``is_related``: the
-    colours are known to be related to the map.
+    foregrounds are too thin, 1, or too wide, -1; ``stops_to_resize``, the same number or 2, then leaves the map as it
+    is. ``is_related``: the colours are known to be related to the map.
     """
     steps = (None, float(step)) if step.ndim == 0 else (step, 0.0)
     out, changed, resizing, doubt = (

@@ -121,7 +121,7 @@ typedef struct {
   int32_t automatic;        // 1: leave a map with exact edges unchanged
   int32_t stops_if_wide;    // 1: leave a map with ramps too wide to be found unchanged, with `changed` = 2
   int32_t is_related;       // 1: the colours are known to be related to the map
-  int32_t stops_to_resize;  // 1: leave a map whose foregrounds are too thin or too wide unchanged
+  int32_t stops_to_resize;  // leave a map unchanged whose foregrounds are too thin: 1, too wide: -1, either: 2
   int32_t threads;
   const volatile int32_t *cancelled;
   float *out;  // [height, width]

@@ -86,12 +86,12 @@ def test_one_side_of_all_edges_must_contradict_the_map(
 
 def test_resizing_never_goes_back_and_ends() -> None:
     """A map that asks for the other direction is repaired as it is; one that asks forever is resized a few times."""
-    calls: list[tuple[Tensor, bool]] = []
+    told: list[list[float] | None] = []
 
-    def once(nearness: Tensor, may_resize: bool) -> tuple[Tensor, Tensor, Tensor]:
-        calls.append((nearness, may_resize))
-        asked = torch.tensor([1.0, 1.0 if len(calls) == 1 else -1.0]).view(2, 1, 1, 1)
-        return nearness + 0.5, torch.full((2, 1, 1, 1), float(len(calls))), asked
+    def once(nearness: Tensor, before: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+        told.append(None if before is None else before.flatten().tolist())
+        asked = torch.tensor([1.0, 1.0 if len(told) == 1 else -1.0]).view(2, 1, 1, 1)
+        return nearness + 0.5, torch.full((2, 1, 1, 1), float(len(told))), asked
 
     point = torch.zeros(2, 1, 32, 32)
     point[..., 16, 16] = 1.0
@@ -99,7 +99,20 @@ def test_resizing_never_goes_back_and_ends() -> None:
     sides = ((repaired - 0.5).sum((1, 2, 3)).sqrt()).tolist()
     assert sides == [2 * resizing._MOST_PX + 1, 3]
     assert doubt.flatten().tolist() == [resizing._MOST_PX + 1, 2]
-    assert [may for _, may in calls] == [True] * resizing._MOST_PX + [False]
+    assert told == [[2.0, 2.0], [1.0, 1.0], *[[1.0, 0.0]] * (resizing._MOST_PX - 2), None]
+
+
+@COMPILED
+@pytest.mark.parametrize("by_px", [-4, 4])
+def test_the_engine_repairs_a_map_that_is_not_to_be_resized_that_way(by_px: int) -> None:
+    image, given, _ = resized_post(0.1, by_px, [])
+    expected = edges._repair(image, given, torch.tensor(edges.STEP_PX), True, True)
+    asked = -by_px // 4
+    assert float(expected[2]) == asked
+    for stops in (0, asked, -asked, 2):
+        repair = native.repair_edges(image[0], given[0, 0], torch.tensor(1.0), True, True, stops_to_resize=stops)
+        assert repair[3] == asked
+        assert_close(repair[0], (given if stops in (asked, 2) else expected[0])[0, 0], atol=1e-3, rtol=0)
 
 
 @pytest.mark.parametrize("by_px", [-4, 5])

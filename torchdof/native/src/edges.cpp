@@ -29,8 +29,8 @@ using constants::doubt::ASSUMED, constants::doubt::CONTRADICTED, constants::doub
 using constants::doubt::MUCH_DILATED, constants::doubt::OF_OTHER;
 using constants::edge_colours::SHARPNESS, constants::edge_colours::SOFT_SHARPNESS;
 using constants::edge_search::LEVELS;
-using constants::resizing::ALL_SIDES, constants::resizing::OTHER_SIDE, constants::resizing::THIN,
-    constants::resizing::WIDE_FAR;
+using constants::resizing::ALL_SIDES, constants::resizing::ANYTHING, constants::resizing::OTHER_SIDE,
+    constants::resizing::THIN, constants::resizing::WIDE_FAR;
 
 // Weights of the clearest edge pixels of far surfaces and of near ones, and of those that have the right colour.
 struct Agreement {
@@ -89,7 +89,7 @@ class Repair : Planes, EdgeMap {
     const Agreement agreement = agreement_of(sampled);
     if (map_.automatic) {
       resizing = resizing_of(agreement, is_soft);
-      if (map_.stops_to_resize && resizing) return UNCHANGED;
+      if (resizing && (map_.stops_to_resize == resizing || map_.stops_to_resize == (int)ANYTHING)) return UNCHANGED;
       if (!(map_.is_related || resizing || is_related(agreement)) || !(is_soft || is_inexact(sampled)))
         return UNCHANGED;
     }

@@ -221,8 +221,9 @@ def _repair_item(
 ) -> tuple[Tensor, float]:
     """:func:`repair` by the compiled engine, for one item: ``[C, H, W]``, ``[H, W]``, and ``[H, W]`` or ``[]``."""
 
-    def once(given: Tensor, may_resize: bool) -> Repaired:
-        repair = functools.partial(native.repair_edges, light, stops_to_resize=may_resize)
+    def once(given: Tensor, before: Tensor | None) -> Repaired:
+        stops = 0 if before is None else int(before)
+        repair = functools.partial(native.repair_edges, light, stops_to_resize=stops)
         flat = given[0, 0]
         repaired, doubt, is_wide, asked = repair(flat, step, auto, of_coc, stops_if_wide=halvings > 0)
         if is_wide:
@@ -289,7 +290,7 @@ def _resized_and_repaired(
 ) -> tuple[Tensor, Tensor]:
     """:func:`repair` by PyTorch."""
 
-    def once(nearness: Tensor, _: bool) -> Repaired:
+    def once(nearness: Tensor, _: Tensor | None) -> Repaired:
         return _repair(image, nearness, step, auto, of_coc, ops, halvings)
 
     return from_resized(once, nearness, -1.0 if of_coc else 1.0, ops)

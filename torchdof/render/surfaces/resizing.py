@@ -17,17 +17,17 @@ from .doubt import OF_OTHER, contradicted
 from .edge_search import DIRECTIONS, PLACES, RINGS
 from .windows import LARGEST, NEVER, highest
 
-__all__ = ["from_resized", "resizing_of"]
+__all__ = ["ANYTHING", "Repaired", "from_resized", "resizing_of"]
 
-_ALL_SIDES = (
-    0.6  # share of wrong pixels beside steps, in each direction, from which foregrounds of hard maps are resized
-)
+_ALL_SIDES = 0.6  # share of wrong pixels beside steps, in each direction, from which a hard map is resized
 _OTHER_SIDE = 0.25  # largest share of wrong pixels on the other side of these steps
 _THIN = 0.4  # share of clear pixels of the far side that contradict a map, from which its foregrounds are too thin
 _BESIDE = 0.2  # the same share beside the steps of a hard map, in each direction
 _WIDE, _WIDE_FAR = 0.3, 0.06  # those of near and far side above which they are too wide for the repair
 _MOST_PX = 6  # px; by which foregrounds are resized at most
-_UNASKED = 2.0  # stands for what a map asks before its first repair
+
+ANYTHING = 2.0
+"""Stands for what the map before asks, where there is none: whatever a map asks for, it is resized."""
 
 Repaired = tuple[Tensor, Tensor, Tensor]
 """A repaired map ``[B, 1, H, W]``, its doubt, and what :func:`resizing_of` says of the map it is repaired from."""
@@ -60,12 +60,13 @@ def resizing_of(clear: Tensor, agreed: Tensor, prior: Tensor, is_soft: Tensor) -
 
 
 def from_resized(
-    once: Callable[[Tensor, bool], Repaired], nearness: Tensor, sign: float, ops: Ops = EAGER
+    once: Callable[[Tensor, Tensor | None], Repaired], nearness: Tensor, sign: float, ops: Ops = EAGER
 ) -> tuple[Tensor, Tensor]:
     """Repairs a map whose foregrounds are first dilated or eroded, if colours ask for it.
 
     Args:
-        once: Repairs a map. If the bool is true and it asks for resizing, only its third result counts.
+        once: Repairs a map. It is resized again if the map asks for the same as the one before, the second argument
+            (:data:`ANYTHING` for the first one); then only the third result counts. None: it is not resized again.
         nearness: The map, ``[B, 1, H, W]``.
         sign: -1 if a smaller value is nearer, else 1.
         ops: Repeats the repair.
@@ -78,19 +79,21 @@ def from_resized(
         before, repaired, doubt, resizing = state
         resized = before
         for by in (-1.0, 1.0):
-            resized = torch.where(resizing == by, _resized(before, by * sign), resized)
-        again, its_doubt, asked = once(resized, may_resize)
+            wanted = resizing == by
+            if is_traced() or wanted.any():
+                resized = torch.where(wanted, _resized(before, by * sign), resized)
+        again, its_doubt, asked = once(resized, resizing if may_resize else None)
         is_new = resizing != 0
         repaired, doubt = torch.where(is_new, again, repaired), torch.where(is_new, its_doubt, doubt)
-        goes_on = (resizing == asked) | (resizing == _UNASKED)  # never back
+        goes_on = (resizing == asked) | (resizing == ANYTHING)  # never back
         resizing = torch.where(goes_on, asked, 0.0)
         return (resized, repaired, doubt, resizing), (resizing != 0).any()
 
+    first = torch.full((nearness.shape[0], 1, 1, 1), ANYTHING, dtype=nearness.dtype, device=nearness.device)
     if is_traced():
-        unasked = nearness.new_full((nearness.shape[0], 1, 1, 1), _UNASKED)
-        state, times = (nearness, nearness, unasked, unasked), _MOST_PX + 1
+        state, times = (nearness, nearness, first, first), _MOST_PX + 1
     else:
-        state, times = (nearness, *once(nearness, True)), _MOST_PX
+        state, times = (nearness, *once(nearness, first)), _MOST_PX
         if not state[-1].any():
             return state[1:3]
     _, repaired, doubt, _ = ops.repeated(step, state, times)
