@@ -14,7 +14,7 @@ from torch import Tensor
 from torchdof import pixels
 from torchdof.optics.blur_table import BlurTable
 from torchdof.pixels import Selected
-from torchdof.render.engines.ops import Level, Ops, Seen
+from torchdof.render.engines.ops import Level, Ops, Seen, Step
 from torchdof.render.layers.plan import Plan
 from torchdof.render.surfaces.disocclusion import counted_behind, is_another_surface, mean_behind, search
 from torchdof.render.surfaces.frame import Highlights, PaddedFrame, PaddedSurface
@@ -47,17 +47,12 @@ class GraphOps(Ops):
         """A branch."""
         return choose(needed(), result, given)
 
-    def repeated(
-        self,
-        step: Callable[[Sequence[Tensor], bool], tuple[Sequence[Tensor], Tensor]],
-        state: Sequence[Tensor],
-        times: int,
-    ) -> Sequence[Tensor]:
+    def repeated(self, step: Step, state: Sequence[Tensor], times: int) -> Sequence[Tensor]:
         """A loop that ends early."""
         number = steps(times)
         before = carried(number, _packed(state))
-        after, goes_on = step(_unpacked(before, state), False)
-        return _unpacked(last(number, before, _packed(after), goes_on), state)
+        after, continues = step(_unpacked(before, state), False)
+        return _unpacked(last(number, before, _packed(after), continues), state)
 
     def by_parts(self, look: Callable[[Tensor], Tensor], pixels: Tensor) -> Tensor:
         """A loop over parts of the list, because each pixel has many neighbours."""

@@ -18,7 +18,7 @@ __all__ = ["carried", "choose", "collect", "last", "operator", "steps", "structu
 
 _CHOICE, _STEP, _COLLECT, _CARRIED, _LAST = (f"torchdof::{n}" for n in ("Choice", "Step", "Collect", "Carried", "Last"))
 """``Choice(result, given, needed)``; ``Step(count)``, the number of a step from 0; ``Collect(result, step)``;
-``Carried(initial, step)``; ``Last(after, step, carried[, goes_on])``. A finished file contains none of them."""
+``Carried(initial, step)``; ``Last(after, step, carried[, continues])``. A finished file contains none of them."""
 
 
 def choose(needed: Tensor, result: Tensor, given: Tensor) -> Tensor:
@@ -41,12 +41,12 @@ def carried(step: Tensor, initial: Tensor) -> Tensor:
     return operator(_CARRIED, [initial, step], initial.shape)
 
 
-def last(step: Tensor, before: Tensor, after: Tensor, goes_on: Tensor | None = None) -> Tensor:
+def last(step: Tensor, before: Tensor, after: Tensor, continues: Tensor | None = None) -> Tensor:
     """The value after the last step, each of which makes ``after`` of ``before``, a value of :func:`carried`.
 
-    The loop ends early after a step in which ``goes_on``, a bool ``[]``, is false.
+    The loop ends early after a step in which ``continues``, a bool ``[]``, is false.
     """
-    return operator(_LAST, [after, step, before, *([] if goes_on is None else [goes_on])], after.shape)
+    return operator(_LAST, [after, step, before, *([] if continues is None else [continues])], after.shape)
 
 
 def operator(name: str, inputs: Sequence[Tensor], shape: Sequence[int | torch.SymInt]) -> Tensor:

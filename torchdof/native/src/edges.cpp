@@ -7,10 +7,10 @@
 
 #include "api.h"
 #include "constants/doubt.h"
-#include "constants/resizing.h"
 #include "constants/edge_colours.h"
 #include "constants/edge_prior.h"
 #include "constants/edges.h"
+#include "constants/resizing.h"
 #include "edge_colours.h"
 #include "edge_map.h"
 #include "edge_rules.h"

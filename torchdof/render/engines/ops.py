@@ -37,6 +37,11 @@ Seen = tuple[Tensor, Tensor]
 """Light and coc behind a map, ``[B, C + 1, h, w]``, and the sum of the levels' votes, ``[B, 1, h, w]``."""
 
 
+Step = Callable[[Sequence[Tensor], bool], tuple[Sequence[Tensor], Tensor]]
+"""A step of :meth:`Ops.repeated`, which makes the next state from a state, and says whether another step is needed, a
+bool ``[]``. A state is maps ``[B, 1, H, W]`` and numbers ``[B, 1, 1, 1]``. False means that no step may follow."""
+
+
 class Ops:
     """The operations of eager code."""
 
@@ -63,19 +68,11 @@ class Ops:
         """
         return result
 
-    def repeated(
-        self,
-        step: Callable[[Sequence[Tensor], bool], tuple[Sequence[Tensor], Tensor]],
-        state: Sequence[Tensor],
-        times: int,
-    ) -> Sequence[Tensor]:
-        """Applies ``step`` to maps ``[B, 1, H, W]`` and numbers ``[B, 1, 1, 1]``, at most a number of ``times``.
-
-        It gives the next state, and whether to go on, a bool ``[]``; it is told whether this is possible.
-        """
-        for left in reversed(range(1 if is_traced() else times)):  # what is traced cannot read values
-            state, goes_on = step(state, left > 0)
-            if not left or not goes_on:
+    def repeated(self, step: Step, state: Sequence[Tensor], times: int) -> Sequence[Tensor]:
+        """The state after some steps, at most ``times``."""
+        for left in reversed(range(1 if is_traced() else times)):  # a trace cannot read values
+            state, continues = step(state, left > 0)
+            if not left or not continues:
                 break
         return state
 

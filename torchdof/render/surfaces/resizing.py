@@ -27,10 +27,10 @@ _WIDE, _WIDE_FAR = 0.3, 0.06  # those of near and far side above which they are 
 _MOST_PX = 6  # px; by which foregrounds are resized at most
 
 ANYTHING = 2.0
-"""Stands for what the map before asks, where there is none: whatever a map asks for, it is resized."""
+"""Stands for the result of :func:`resizing_of` before the first repair: the map is resized for either error."""
 
 Repaired = tuple[Tensor, Tensor, Tensor]
-"""A repaired map ``[B, 1, H, W]``, its doubt, and what :func:`resizing_of` says of the map it is repaired from."""
+"""A repaired map ``[B, 1, H, W]``, its doubt, and the result of :func:`resizing_of` for the map before this repair."""
 
 
 def resizing_of(clear: Tensor, agreed: Tensor, prior: Tensor, is_soft: Tensor) -> Tensor:
@@ -65,8 +65,9 @@ def from_resized(
     """Repairs a map whose foregrounds are first dilated or eroded, if colours ask for it.
 
     Args:
-        once: Repairs a map. It is resized again if the map asks for the same as the one before, the second argument
-            (:data:`ANYTHING` for the first one); then only the third result counts. None: it is not resized again.
+        once: Repairs a map. Its second argument is the result of :func:`resizing_of` for the map before, or
+            :data:`ANYTHING`. If the new result is the same, the map is resized again, and only the third result counts;
+            never with None.
         nearness: The map, ``[B, 1, H, W]``.
         sign: -1 if a smaller value is nearer, else 1.
         ops: Repeats the repair.
@@ -85,8 +86,8 @@ def from_resized(
         again, its_doubt, asked = once(resized, resizing if may_resize else None)
         is_new = resizing != 0
         repaired, doubt = torch.where(is_new, again, repaired), torch.where(is_new, its_doubt, doubt)
-        goes_on = (resizing == asked) | (resizing == ANYTHING)  # never back
-        resizing = torch.where(goes_on, asked, 0.0)
+        continues = (resizing == asked) | (resizing == ANYTHING)  # never back
+        resizing = torch.where(continues, asked, 0.0)
         return (resized, repaired, doubt, resizing), (resizing != 0).any()
 
     first = torch.full((nearness.shape[0], 1, 1, 1), ANYTHING, dtype=nearness.dtype, device=nearness.device)
