@@ -419,11 +419,8 @@ def repair_edges(
     is. ``is_related``: the colours are known to be related to the map.
     """
     steps = (None, float(step)) if step.ndim == 0 else (step, 0.0)
-    out, changed, resizing, doubt = (
-        _empty(*nearness.shape),
-        *(ctypes.c_int32(0) for _ in range(2)),
-        ctypes.c_double(0.0),
-    )
+    out, doubt = _empty(*nearness.shape), ctypes.c_double(0.0)
+    changed, resizing = ctypes.c_int32(0), ctypes.c_int32(0)
     options = (of_coc, *steps, auto, stops_if_wide, is_related, stops_to_resize)
     _of_map("repair_edges", light, nearness, options, out, changed, doubt, resizing)
     return out if changed.value == 1 else nearness, doubt.value, changed.value == _STOPPED, resizing.value

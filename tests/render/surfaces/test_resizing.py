@@ -95,7 +95,7 @@ def test_resizing_never_goes_back_and_ends() -> None:
 
     point = torch.zeros(2, 1, 32, 32)
     point[..., 16, 16] = 1.0
-    repaired, doubt = from_resized(once, point, 1.0)
+    repaired, doubt = from_resized(once, point, False)
     sides = ((repaired - 0.5).sum((1, 2, 3)).sqrt()).tolist()
     assert sides == [2 * resizing._MOST_PX + 1, 3]
     assert doubt.flatten().tolist() == [resizing._MOST_PX + 1, 2]

@@ -70,8 +70,7 @@ def doubt_of(clear: Tensor, agreed: Tensor) -> tuple[Tensor, Tensor]:
     """
     near, far = contradicted(clear, agreed)
     doubt = (torch.minimum(near, far) - _CONTRADICTED) / (_OFTEN_CONTRADICTED - _CONTRADICTED)
-    dilated = (near - OF_OTHER * far - _DILATED) / (_MUCH_DILATED - _DILATED)
-    dilated = dilated.clamp(0.0, 1.0)
+    dilated = ((near - OF_OTHER * far - _DILATED) / (_MUCH_DILATED - _DILATED)).clamp(0.0, 1.0)
     return doubt.clamp(0.0, 1.0) * (1.0 - dilated), dilated
 
 

@@ -210,7 +210,9 @@ def repair(
         if repaired is given:
             return nearness, doubt
     else:
-        repaired, doubt = _resized_and_repaired(light, given, step, auto, of_coc, ops, halvings)
+        repaired, doubt = from_resized(
+            lambda resized, _: _repair(light, resized, step, auto, of_coc, ops, halvings), given, of_coc, ops
+        )
     if nearness.dtype == torch.float32:
         return repaired, doubt
     return torch.where(repaired == given, nearness, repaired.to(nearness.dtype)), doubt
@@ -233,7 +235,7 @@ def _repair_item(
         return given if repaired is flat else repaired[None, None], *numbers
 
     given = nearness[None, None]
-    repaired, doubt = from_resized(once, given, -1.0 if of_coc else 1.0)
+    repaired, doubt = from_resized(once, given, of_coc)
     return nearness if repaired is given else repaired[0, 0], float(doubt)
 
 
@@ -277,23 +279,6 @@ def judged(image: Tensor, coc_px: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     nearness = -coc_px.float().expand(image.shape[0], -1, -1, -1)
     edges = _Map.of(image, nearness, nearness.new_tensor(STEP_PX), True).edges
     return edges.is_edge, edges.is_edge & edges.is_ramp, mended(image, coc_px, "auto")
-
-
-def _resized_and_repaired(
-    image: Tensor,
-    nearness: Tensor,
-    step: Tensor,
-    auto: bool,
-    of_coc: bool,
-    ops: Ops = EAGER,
-    halvings: int = _HALVINGS,
-) -> tuple[Tensor, Tensor]:
-    """:func:`repair` by PyTorch."""
-
-    def once(nearness: Tensor, _: Tensor | None) -> Repaired:
-        return _repair(image, nearness, step, auto, of_coc, ops, halvings)
-
-    return from_resized(once, nearness, -1.0 if of_coc else 1.0, ops)
 
 
 class _Map(NamedTuple):
@@ -431,9 +416,9 @@ def _errors_of(scene: _Map, sample: _Sample, auto: bool, is_related: Tensor, ops
     score = judge(scene.looks, scene.nearness, sampled, sharpness, True, False, ops).score
     shares = calibrate(scene.light, pixels.pick(kind, sampled)[0], score)
     prior = shares[kind]
-    doubt = scene.nearness.new_zeros(scene.nearness.shape[0], 1, 1, 1)
+    none = scene.nearness.new_zeros(scene.nearness.shape[0], 1, 1, 1)
     if not auto:
-        return _Errors(is_soft, sharpness, prior, edges.is_edge, doubt, doubt, doubt)
+        return _Errors(is_soft, sharpness, prior, edges.is_edge, none, none, none)
 
     # colour agrees with the map at clear pixels: in the outermost ring of a step, or near a ramp's ends; on one side of
     # the edges only where the map's foreground is too thin, and at half of them where it has no relation
@@ -445,7 +430,7 @@ def _errors_of(scene: _Map, sample: _Sample, auto: bool, is_related: Tensor, ops
     clear, agreed = torch.stack(sides).chunk(2)
     assumed = 0.5 * PRIOR_COUNT  # pixels, half of which agree
     is_related = is_related | (agreed + 0.5 * assumed > _RELATED * (clear + assumed)).any(0)
-    resizing = doubt
+    resizing = none
     if active().resizing:
         resizing = resizing_of(clear, agreed, shares, is_soft).to(dtype)
         is_related = is_related | (resizing != 0)
@@ -455,10 +440,8 @@ def _errors_of(scene: _Map, sample: _Sample, auto: bool, is_related: Tensor, ops
     in_doubt, dilated = (torch.where(is_soft, found, 0.0) for found in doubt_of(clear, agreed))
     # ramps of a pixel are means over pixels, or artefacts of compression: there is little to doubt
     faded = in_doubt * (softness - 1.0).clamp(0.0, 1.0)
-    doubt, dilated = (
-        found.to(dtype) if applies else doubt
-        for found, applies in ((faded, active().in_doubt), (dilated, active().dilated))
-    )
+    doubt = faded.to(dtype) if active().in_doubt else none
+    dilated = dilated.to(dtype) if active().dilated else none
     return _Errors(is_soft, sharpness, prior, doubtful, doubt, dilated, resizing)
 
 
@@ -526,5 +509,5 @@ def _empty(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bo
 # The number of pixels to process depends on the data, which compiled graphs do not support.
 @one_operator("torchdof::repair_edges", _empty)
 def _operator(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool) -> tuple[Tensor, Tensor]:
-    repaired, doubt = _resized_and_repaired(image, nearness, step, auto, of_coc)
+    repaired, doubt = from_resized(lambda resized, _: _repair(image, resized, step, auto, of_coc), nearness, of_coc)
     return repaired.clone(), doubt

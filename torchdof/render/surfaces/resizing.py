@@ -60,7 +60,7 @@ def resizing_of(clear: Tensor, agreed: Tensor, prior: Tensor, is_soft: Tensor) -
 
 
 def from_resized(
-    once: Callable[[Tensor, Tensor | None], Repaired], nearness: Tensor, sign: float, ops: Ops = EAGER
+    once: Callable[[Tensor, Tensor | None], Repaired], nearness: Tensor, of_coc: bool, ops: Ops = EAGER
 ) -> tuple[Tensor, Tensor]:
     """Repairs a map whose foregrounds are first dilated or eroded, if colours ask for it.
 
@@ -69,7 +69,7 @@ def from_resized(
             :data:`ANYTHING`. If the new result is the same, the map is resized again, and only the third result counts;
             never with None.
         nearness: The map, ``[B, 1, H, W]``.
-        sign: -1 if a smaller value is nearer, else 1.
+        of_coc: Whether it is a map of the coc instead, in which a larger value is farther.
         ops: Repeats the repair.
 
     Returns:
@@ -82,7 +82,7 @@ def from_resized(
         for by in (-1.0, 1.0):
             wanted = resizing == by
             if is_traced() or wanted.any():
-                resized = torch.where(wanted, _resized(before, by * sign), resized)
+                resized = torch.where(wanted, _resized(before, -by if of_coc else by), resized)
         again, its_doubt, asked = once(resized, resizing if may_resize else None)
         is_new = resizing != 0
         repaired, doubt = torch.where(is_new, again, repaired), torch.where(is_new, its_doubt, doubt)
