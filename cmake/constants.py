@@ -23,7 +23,7 @@ MODULES = (
     *(f"render/{name}" for name in ("exposure", "highlights", "pipeline")),
     *(f"render/surfaces/{name}" for name in ("border", "disocclusion", "doubt", "edge_colours", "edge_prior")),
     *(f"render/surfaces/{name}" for name in ("edge_search", "edges", "emitters", "frame", "matting", "missed")),
-    *(f"render/surfaces/{name}" for name in ("resizing", "soft_maps", "windows")),
+    *(f"render/surfaces/{name}" for name in ("registration", "soft_maps", "windows")),
     *(f"render/layers/{name}" for name in ("composite", "convolution", "downsampling", "field")),
     *(f"render/layers/{name}" for name in ("layer_cocs", "layer_weights", "plan")),
 )
@@ -31,7 +31,7 @@ MODULES = (
 
 SINGLE = (
     *("composite", "disocclusion", "doubt", "edge_colours", "edge_prior", "edge_search", "edges"),
-    *("emitters", "frame", "highlights", "matting", "missed", "pipeline", "resizing", "soft_maps", "windows"),
+    *("emitters", "frame", "highlights", "matting", "missed", "pipeline", "registration", "soft_maps", "windows"),
 )
 """Modules whose C++ computes with single precision alone: their constants are ``float``, the others' ``double``."""
 

@@ -136,14 +136,18 @@ class GraphOps(Ops):
 
 
 def _packed(state: Sequence[Tensor]) -> Tensor:
-    """Maps ``[B, 1, H, W]``, the first one of all, and numbers ``[B, 1, 1, 1]`` as one tensor."""
-    return torch.cat([part.expand_as(state[0]) for part in state], 1)
+    """Tensors of any shape as one list."""
+    return torch.cat([part.reshape(-1) for part in state])
 
 
 def _unpacked(packed: Tensor, like: Sequence[Tensor]) -> list[Tensor]:
-    """Maps and numbers of the same sizes as others."""
-    parts = zip(packed.split(1, 1), like, strict=True)
-    return [part.narrow(2, 0, size.shape[2]).narrow(3, 0, size.shape[3]) for part, size in parts]
+    """Tensors of four dimensions of the same shapes as others."""
+    parts, start = [], 0
+    for shape in (part.shape for part in like):
+        count = shape[0] * shape[1] * shape[2] * shape[3]
+        parts.append(packed.narrow(0, start, count).reshape(shape))
+        start = start + count
+    return parts
 
 
 def _counts(area: Sequence[int], size: tuple[int, int]) -> tuple[list[int], list[int]]:

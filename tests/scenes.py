@@ -461,6 +461,21 @@ def resized_post(spread: float, by_px: int, widths: Sequence[int]) -> tuple[Tens
     return light.expand(1, 3, -1, -1).contiguous(), soft.contiguous(), exact
 
 
+def shifted_disc(spread: float, right: int, down: int, widths: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
+    """An image of a disc, a map of the coc in which it is shifted by so many pixels, and the exact map.
+
+    Other arguments as for :func:`resized_post`.
+    """
+    generator = torch.Generator().manual_seed(0)
+    is_disc = (torch.arange(192) - 90).square() + (torch.arange(176)[:, None] - 80).square() < 60**2
+    light = torch.where(is_disc, 0.25, 0.6) * torch.exp(spread * torch.randn(is_disc.shape, generator=generator))
+    exact = torch.where(is_disc, -12.0, 0.5)[None, None]
+    given = exact.roll((down, right), (-2, -1))
+    for side in widths:
+        given = mean_around(given, side // 2)
+    return light.expand(1, 3, -1, -1).contiguous(), given.contiguous(), exact
+
+
 def furry_post(
     background: float = 0.8, height: int = 224, width: int = 160, noise: float = 0.02
 ) -> tuple[Tensor, Tensor, Tensor]:

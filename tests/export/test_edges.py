@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnxruntime
@@ -9,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.scenes import furry_post, resized_post, wavy_post
+from tests.scenes import furry_post, resized_post, shifted_disc, wavy_post
 from torchdof import Camera, blur_by_coc
 from torchdof.export import describe
 from torchdof.export.verification import TOLERANCE, local_range, session
@@ -90,17 +91,26 @@ def test_a_file_without_edges_to_repair_is_bit_exact_in_focus(
     assert np.array_equal(got, image.numpy())
 
 
-@pytest.mark.parametrize(("by_px", "widths"), [(-3, []), (3, []), (-4, [5, 5]), (5, [5, 5]), (0, [])])
-def test_a_file_resizes_foregrounds_that_are_too_thin_or_too_wide(
-    runner: onnxruntime.InferenceSession, monkeypatch: pytest.MonkeyPatch, by_px: int, widths: list[int]
+@pytest.mark.parametrize(
+    ("scene", "edit"),
+    [
+        *((resized_post, edit) for edit in [(-3, []), (3, []), (-4, [5, 5]), (5, [5, 5]), (0, [])]),
+        *((shifted_disc, edit) for edit in [(1, 0, []), (-4, 2, []), (3, -2, [3]), (0, 3, [5, 5])]),
+    ],
+)
+def test_a_file_resizes_foregrounds_and_shifts_maps(
+    scene: Callable[..., tuple[Tensor, Tensor, Tensor]],
+    edit: tuple[Any, ...],
+    runner: onnxruntime.InferenceSession,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """In a loop, whose number of steps depends on the frame; beside it another item that needs none."""
     monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
-    image, coc, exact = resized_post(0.1, by_px, widths)
+    image, coc, exact = scene(0.1, *edit)
     image, coc = image[:, :1].repeat(2, 1, 1, 1), torch.cat([coc, exact]) / 6.0
     expected = rendered(image, coc, "auto")
-    with without(["resizing"]):
-        assert (float((expected - rendered(image, coc, "auto")).abs().max()) > 0.05) == (by_px != 0)
+    with without(["registration"]):
+        assert (float((expected - rendered(image, coc, "auto")).abs().max()) > 0.05) == (edit != (0, []))
     got = runner.run(None, {"image": image.numpy(), "coc_px": coc.numpy()})[0]
     assert error(got, expected, image) <= TOLERANCE
 

@@ -279,9 +279,9 @@ void check_edges(unsigned seed) {
                               threads,
                               &never,
                               out.data()};
-    int32_t changed = 0, resizing = 0;
+    int32_t changed = 0, asked = 0;
     double doubt = 0.0;
-    if (torchdof_repair_edges(&map, &changed, &doubt, &resizing) != TORCHDOF_OK)
+    if (torchdof_repair_edges(&map, &changed, &doubt, &asked) != TORCHDOF_OK)
       fail("its edges cannot be repaired", int(seed));
     if (changed != 1) out = nearness;
     if (map.is_coc) {

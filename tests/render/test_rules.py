@@ -54,7 +54,7 @@ def scene_for(rule: str) -> tuple[Tensor, Tensor]:
     scene = SCENES[name]
     depth = scene.depth if rule == "whole_highlights" else degrade(scene.depth, kind)
     coc_px = scene.camera.coc_px(depth, scene.image.shape[-1])
-    if rule == "resizing":
+    if rule == "registration":
         coc_px = -highest(-coc_px, 3)
     if rule == "dilated":
         coc_px = -mean_around(highest(-coc_px, 2), 1)

@@ -408,22 +408,22 @@ def repair_edges(
     of_coc: bool = False,
     stops_if_wide: bool = False,
     is_related: bool = False,
-    stops_to_resize: int = 0,
+    stops: int = 0,
 ) -> tuple[Tensor, float, bool, int]:
     """Repairs the edges of a depth map, as :func:`torchdof.render.surfaces.edges.repair`, for one image.
 
     ``light`` is ``[C, H, W]``, ``nearness`` ``[H, W]``, ``step`` ``[H, W]`` or ``[]``. The results are the map, the
     input itself if it needs no repair, how much it is in doubt, 0 to 1, less how far its foregrounds are dilated, 0 to
-    1, whether the repair has stopped because of ramps too wide to be found, with ``stops_if_wide``, and whether
-    foregrounds are too thin, 1, or too wide, -1; ``stops_to_resize``, the same number or 2, then leaves the map as it
-    is. ``is_related``: the colours are known to be related to the map.
+    1, whether the repair has stopped because of ramps too wide to be found, with ``stops_if_wide``, and which edits of
+    the map colours ask for, of :func:`torchdof.render.surfaces.registration.edits_of`, a bit each. The map stays as it
+    is if they ask for one of ``stops``. ``is_related``: the colours are known to be related to the map.
     """
     steps = (None, float(step)) if step.ndim == 0 else (step, 0.0)
     out, doubt = _empty(*nearness.shape), ctypes.c_double(0.0)
-    changed, resizing = ctypes.c_int32(0), ctypes.c_int32(0)
-    options = (of_coc, *steps, auto, stops_if_wide, is_related, stops_to_resize)
-    _of_map("repair_edges", light, nearness, options, out, changed, doubt, resizing)
-    return out if changed.value == 1 else nearness, doubt.value, changed.value == _STOPPED, resizing.value
+    changed, edits = ctypes.c_int32(0), ctypes.c_int32(0)
+    options = (of_coc, *steps, auto, stops_if_wide, is_related, stops)
+    _of_map("repair_edges", light, nearness, options, out, changed, doubt, edits)
+    return out if changed.value == 1 else nearness, doubt.value, changed.value == _STOPPED, edits.value
 
 
 def missed_parts(light: Tensor, coc_px: Tensor) -> tuple[Tensor, float]:

@@ -113,28 +113,28 @@ TORCHDOF_API void torchdof_free(torchdof_job *job);
 // is farther). Values that are not finite stay.
 typedef struct {
   int32_t height, width, channels;
-  const float *light;       // [channels, height, width]
-  const float *nearness;    // [height, width]
-  int32_t is_coc;           // 1: `nearness` is coc
-  const float *steps;       // smallest difference between two surfaces [height, width], or null:
-  float step;               // the same for all pixels
-  int32_t automatic;        // 1: leave a map with exact edges unchanged
-  int32_t stops_if_wide;    // 1: leave a map with ramps too wide to be found unchanged, with `changed` = 2
-  int32_t is_related;       // 1: the colours are known to be related to the map
-  int32_t stops_to_resize;  // leave a map unchanged whose foregrounds are too thin: 1, too wide: -1, either: 2
+  const float *light;     // [channels, height, width]
+  const float *nearness;  // [height, width]
+  int32_t is_coc;         // 1: `nearness` is coc
+  const float *steps;     // smallest difference between two surfaces [height, width], or null:
+  float step;             // the same for all pixels
+  int32_t automatic;      // 1: leave a map with exact edges unchanged
+  int32_t stops_if_wide;  // 1: leave a map with ramps too wide to be found unchanged, with `changed` = 2
+  int32_t is_related;     // 1: the colours are known to be related to the map
+  int32_t stops;          // bits of the edits for which to leave a map unchanged, if colours ask for one of them
   int32_t threads;
   const volatile int32_t *cancelled;
   float *out;  // [height, width]
 } torchdof_map;
 
 // changed: 0 if the map needs no repair, 2 if it stops because of its ramps; out is then not written. doubt: how much
-// the map is in doubt, 0 to 1, less how far its foregrounds are dilated, 0 to 1. resizing: whether they are too thin,
-// 1, too wide, -1, or neither, 0.
-TORCHDOF_API int32_t torchdof_repair_edges(const torchdof_map *map, int32_t *changed, double *doubt, int32_t *resizing);
+// the map is in doubt, 0 to 1, less how far its foregrounds are dilated, 0 to 1. edits: those that colours ask for,
+// a bit each, in the order of render/surfaces/registration.py.
+TORCHDOF_API int32_t torchdof_repair_edges(const torchdof_map *map, int32_t *changed, double *doubt, int32_t *edits);
 
-// Gives missed fine parts of blurred foregrounds to them, in a map of coc; reads no members from steps to
-// stops_to_resize. out is [2, height, width]: the map, and how unlike the background each pixel is, 0 to 1; 1 where
-// none is known. share: how far the map has missed parts, 0 to 1.
+// Gives missed fine parts of blurred foregrounds to them, in a map of coc; reads no members from steps to stops. out
+// is [2, height, width]: the map, and how unlike the background each pixel is, 0 to 1; 1 where none is known. share:
+// how far the map has missed parts, 0 to 1.
 TORCHDOF_API int32_t torchdof_missed_parts(const torchdof_map *map, double *share);
 
 // Blurs the edges of a map of coc [height, width] that is in doubt, from the map before its repair and after it, and

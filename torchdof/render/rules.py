@@ -47,7 +47,7 @@ class Rules:
     directions: bool = _rule("learns the errors of a map for each direction of an edge")
     far_lead: bool = _rule("asks for a lead from far surfaces")
     more_blurred: bool = _rule("gives undecided pixels of soft maps to a more blurred near surface")
-    resizing: bool = _rule("dilates or erodes foregrounds that a map draws too thin or too wide")
+    registration: bool = _rule("resizes foregrounds that a map draws too thin or too wide, and shifts the map")
     dilated: bool = _rule("gives undecided pixels to either surface where foregrounds are too wide")
     neighbours: bool = _rule("lets neighbours decide together in soft maps")
     like_scores: bool = _rule("averages scores over neighbours of similar colour")

@@ -10,7 +10,7 @@
 #include "constants/edge_colours.h"
 #include "constants/edge_prior.h"
 #include "constants/edges.h"
-#include "constants/resizing.h"
+#include "constants/registration.h"
 #include "edge_colours.h"
 #include "edge_map.h"
 #include "edge_rules.h"
@@ -29,12 +29,16 @@ using constants::doubt::ASSUMED, constants::doubt::CONTRADICTED, constants::doub
 using constants::doubt::MUCH_DILATED, constants::doubt::OF_OTHER;
 using constants::edge_colours::SHARPNESS, constants::edge_colours::SOFT_SHARPNESS;
 using constants::edge_search::LEVELS;
-using constants::resizing::ALL_SIDES, constants::resizing::ANYTHING, constants::resizing::OTHER_SIDE,
-    constants::resizing::THIN, constants::resizing::WIDE_FAR;
+using constants::registration::ONE_SIDE, constants::registration::RESIZED, constants::registration::SHIFTED,
+    constants::registration::SIDES;
+using constants::registration::THIN, constants::registration::WIDE_FAR;
 
-// Weights of the clearest edge pixels of far surfaces and of near ones, and of those that have the right colour.
+// Weights of the clearest edge pixels of far surfaces and of near ones, and of those that have the right colour: of
+// all, and by direction.
 struct Agreement {
-  double clear[2] = {}, agreed[2] = {};
+  struct Weights {
+    double clear[2] = {}, agreed[2] = {};
+  } all, by[DIRECTIONS];
 };
 
 // Planes of all pixels.
@@ -60,10 +64,9 @@ class Repair : Planes, EdgeMap {
   // 4. Find and decide the edges of the whole frame; move pixels that have the depth of the wrong surface.
   // 5. In a soft map also remove ringing, and restore the nearness of small lamps that a blur has reduced.
   // Returns whether the map has changed, or that it stopped because of its ramps; doubt: how much the image contradicts
-  // a soft map, 0 to 1, less how far foregrounds are dilated, 0 to 1; resizing: whether they are too thin, 1, or too
-  // wide, -1.
-  Result run(double &doubt, int &resizing) {
-    doubt = resizing = 0;
+  // a soft map, 0 to 1, less how far foregrounds are dilated, 0 to 1; edits: bits of those that colours ask for.
+  Result run(double &doubt, int &edits) {
+    doubt = edits = 0;
     const int every = (int)std::ceil(std::sqrt((double)area_ / SAMPLED));
     // where the sample is a small part of the frame, only its edges are found first
     const bool finds_twice = map_.automatic && every > 4;
@@ -88,10 +91,9 @@ class Repair : Planes, EdgeMap {
     calibrate(sampled);
     const Agreement agreement = agreement_of(sampled);
     if (map_.automatic) {
-      resizing = resizing_of(agreement, is_soft);
-      if (resizing && (map_.stops_to_resize == resizing || map_.stops_to_resize == (int)ANYTHING)) return UNCHANGED;
-      if (!(map_.is_related || resizing || is_related(agreement)) || !(is_soft || is_inexact(sampled)))
-        return UNCHANGED;
+      edits = edits_of(agreement, is_soft);
+      if (edits & map_.stops) return UNCHANGED;
+      if (!(map_.is_related || edits || is_related(agreement)) || !(is_soft || is_inexact(sampled))) return UNCHANGED;
     }
     parallel(height_,
              [&](int y) { memcpy(map_.out + pixel(y, 0), map_.nearness + pixel(y, 0), width_ * sizeof(float)); });
@@ -209,8 +211,10 @@ class Repair : Planes, EdgeMap {
           continue;
         const float weight = weight_of(score);
         const bool is_near = level > 0.5f;
-        found.clear[is_near] += weight;
-        if ((score > 0) == is_near) found.agreed[is_near] += weight;
+        for (Agreement::Weights *sums : {&found.all, &found.by[edge.kind % DIRECTIONS]}) {
+          sums->clear[is_near] += weight;
+          if ((score > 0) == is_near) sums->agreed[is_near] += weight;
+        }
       }
     return found;
   }
@@ -220,7 +224,7 @@ class Repair : Planes, EdgeMap {
   static bool is_related(const Agreement &found) {
     const float assumed = 0.5f * PRIOR_COUNT;  // pixels, half of which agree
     const auto agrees = [&](bool side) {
-      return (found.agreed[side] + 0.5f * assumed) / (found.clear[side] + assumed) > RELATED;
+      return (found.all.agreed[side] + 0.5f * assumed) / (found.all.clear[side] + assumed) > RELATED;
     };
     return agrees(false) || agrees(true);
   }
@@ -230,37 +234,44 @@ class Repair : Planes, EdgeMap {
   };
 
   // render/surfaces/doubt.py, contradicted: of the near side, or the far one.
-  static float contradicted(const Agreement &found, bool side) {
+  static float contradicted(const Agreement::Weights &found, bool side) {
     return (float)((found.clear[side] - found.agreed[side]) / (found.clear[side] + ASSUMED));
   }
 
   // render/surfaces/doubt.py, doubt_of.
   static Doubt doubt_of(const Agreement &found) {
-    const float near = contradicted(found, true), far = contradicted(found, false);
+    const float near = contradicted(found.all, true), far = contradicted(found.all, false);
     const float doubt = clamp01((std::min(near, far) - CONTRADICTED) / (OFTEN_CONTRADICTED - CONTRADICTED));
     const float dilated =
         clamp01((near - OF_OTHER * far - constants::doubt::DILATED) / (MUCH_DILATED - constants::doubt::DILATED));
     return {doubt * (1.0f - dilated), dilated};
   }
 
-  // render/surfaces/resizing.py, resizing_of.
-  int resizing_of(const Agreement &found, bool is_soft) const {
-    const float near = contradicted(found, true), far = contradicted(found, false);
-    bool is_thin = far > THIN && far > OF_OTHER * near,
-         is_wide = near > constants::resizing::WIDE && near > OF_OTHER * far && far > WIDE_FAR;
-    if (!is_soft) {
-      float lowest[2] = {1, 1}, highest[2] = {};
-      for (int side = 0; side < 2; side++)
-        for (int direction = 0; direction < DIRECTIONS; direction++) {
-          const float wrong = this->wrong(side * (RINGS * DIRECTIONS + KINDS) + direction);
-          lowest[side] = std::min(lowest[side], wrong);
-          highest[side] = std::max(highest[side], wrong);
-        }
-      is_thin =
-          (is_thin && lowest[0] > constants::resizing::BESIDE) || (lowest[0] > ALL_SIDES && highest[1] < OTHER_SIDE);
-      is_wide = is_wide || (lowest[1] > ALL_SIDES && highest[0] < OTHER_SIDE);
+  // render/surfaces/registration.py, edits_of: a bit for each edit.
+  int edits_of(const Agreement &found, bool is_soft) const {
+    float beside[DIRECTIONS], apart[DIRECTIONS], least_far = 1;
+    for (int d = 0; d < DIRECTIONS; d++) {
+      float share = 0;
+      for (int level = 0; level < LEVELS; level++) share += shares_[(2 * RINGS + level) * DIRECTIONS + d];
+      beside[d] = is_soft ? 2.0f * share / LEVELS - 1.0f : shares_[d] + shares_[RINGS * DIRECTIONS + d] - 1.0f;
+      apart[d] = contradicted(found.by[d], false) - contradicted(found.by[d], true);
+      least_far = std::min(least_far, shares_[d]);
     }
-    return is_thin - is_wide;
+    const auto [least, most] = std::minmax_element(beside, beside + DIRECTIONS);
+    const float near = contradicted(found.all, true), far = contradicted(found.all, false);
+    const bool is_thin =
+                   far > THIN && far > OF_OTHER * near && (is_soft || least_far > constants::registration::BESIDE),
+               is_wide = near > constants::registration::WIDE && near > OF_OTHER * far && far > WIDE_FAR;
+    int edits = (is_thin || *least > RESIZED) + 2 * (is_wide || (!is_soft && *most < -RESIZED));
+    for (int k = 0; k < (int)std::size(SIDES); k++) {
+      const int side = SIDES[k], other = DIRECTIONS - 1 - side;
+      const auto moves = [&](const float *excess) {
+        const float outward = excess[side], inward = -excess[other];
+        return std::min(outward, inward) > ONE_SIDE && 0.5f * (outward + inward) > SHIFTED;
+      };
+      if (moves(beside) || moves(apart)) edits |= 4 << k;
+    }
+    return edits;
   }
 
   // Share of pixels that show the near surface, by kind: a maximum-likelihood fit (EM) to the scores, with PRIOR_COUNT
@@ -373,6 +384,6 @@ class Repair : Planes, EdgeMap {
 }  // namespace
 }  // namespace torchdof
 
-int32_t torchdof_repair_edges(const torchdof_map *map, int32_t *changed, double *doubt, int32_t *resizing) {
-  return torchdof::guarded([&] { *changed = torchdof::Repair(*map).run(*doubt, *resizing); });
+int32_t torchdof_repair_edges(const torchdof_map *map, int32_t *changed, double *doubt, int32_t *edits) {
+  return torchdof::guarded([&] { *changed = torchdof::Repair(*map).run(*doubt, *edits); });
 }

@@ -44,7 +44,7 @@ from .edge_colours import (
 from .edge_prior import PRIOR_COUNT, weight_of
 from .edge_search import REACH, RINGS, Edges
 from .missed import completed
-from .resizing import Repaired, from_resized, resizing_of
+from .registration import EDITS, Repaired, edits_of, registered
 from .soft_maps import Softness, lift_lamps, sigma_of, without_ringing
 from .windows import LARGEST, highest
 
@@ -191,8 +191,8 @@ def repair(
 
     Returns:
         ``[B, 1, H, W]``, constant to autograd; unchanged pixels keep their values to the bit. ``nearness`` itself if
-        the compiled engine leaves all of it unchanged. And how much the map, resized, is in doubt, 0 to 1, less how far
-        its foregrounds are dilated, 0 to 1, ``[B, 1, 1, 1]``, both of :func:`.doubt.doubt_of`, in soft maps.
+        the compiled engine leaves all of it unchanged. And how much the map, registered, is in doubt, 0 to 1, less how
+        far its foregrounds are dilated, 0 to 1, ``[B, 1, 1, 1]``, both of :func:`.doubt.doubt_of`, in soft maps.
     """
     device = image.device.type
     if torch.is_autocast_enabled(device):  # which would compute in half precision
@@ -210,8 +210,8 @@ def repair(
         if repaired is given:
             return nearness, doubt
     else:
-        repaired, doubt = from_resized(
-            lambda resized, _: _repair(light, resized, step, auto, of_coc, ops, halvings), given, of_coc, ops
+        repaired, doubt = registered(
+            lambda edited, _: _repair(light, edited, step, auto, of_coc, ops, halvings), given, of_coc, ops
         )
     if nearness.dtype == torch.float32:
         return repaired, doubt
@@ -223,19 +223,20 @@ def _repair_item(
 ) -> tuple[Tensor, float]:
     """:func:`repair` by the compiled engine, for one item: ``[C, H, W]``, ``[H, W]``, and ``[H, W]`` or ``[]``."""
 
-    def once(given: Tensor, before: Tensor | None) -> Repaired:
-        stops = 0 if before is None else int(before)
-        repair = functools.partial(native.repair_edges, light, stops_to_resize=stops)
+    def once(given: Tensor, following: Tensor | None) -> Repaired:
+        stops = 0 if following is None else sum(1 << k for k, edit in enumerate(following.flatten()) if edit)
+        repair = functools.partial(native.repair_edges, light, stops=stops)
         flat = given[0, 0]
-        repaired, doubt, is_wide, asked = repair(flat, step, auto, of_coc, stops_if_wide=halvings > 0)
+        repaired, doubt, is_wide, edits = repair(flat, step, auto, of_coc, stops_if_wide=halvings > 0)
         if is_wide:
             narrow, is_related = _narrowed(light[None], given, step[None, None], auto, of_coc, halvings)
-            repaired, doubt, _, asked = repair(narrow[0, 0], step, auto, of_coc, is_related=bool(is_related))
-        numbers = given.new_tensor([[doubt], [asked]])[..., None, None]
-        return given if repaired is flat else repaired[None, None], *numbers
+            repaired, doubt, _, edits = repair(narrow[0, 0], step, auto, of_coc, is_related=bool(is_related))
+        bits = [edits >> k & 1 for k in range(EDITS)]
+        its_doubt, asked = (given.new_tensor(found).view(1, -1, 1, 1) for found in ([doubt], bits))
+        return given if repaired is flat else repaired[None, None], its_doubt, asked
 
     given = nearness[None, None]
-    repaired, doubt = from_resized(once, given, of_coc)
+    repaired, doubt = registered(once, given, of_coc)
     return nearness if repaired is given else repaired[0, 0], float(doubt)
 
 
@@ -320,11 +321,12 @@ class _Map(NamedTuple):
         rows, columns = (_from_border(n, self.nearness.device) // _BLOCK for n in (height, width))
         return pixels.indices(self.edges.is_edge & ((rows[:, None] + columns) % every == 0))
 
-    def sums(self, sampled: Tensor, *parts: Tensor) -> tuple[Tensor, ...]:
-        """Sums of values ``[P]`` of sampled pixels over each item, ``[B, 1, 1, 1]`` each."""
-        items = self.nearness.new_zeros(len(parts), self.nearness.shape[0], dtype=widest_float(self.nearness.device))
-        found = items.index_add(1, self.item_of(sampled), torch.stack(parts).to(items.dtype))
-        return found[..., None, None, None].unbind(0)
+    def sums(self, sampled: Tensor, *parts: Tensor, groups: int = 1, group: Tensor | int = 0) -> tuple[Tensor, ...]:
+        """Sums of values ``[P]`` of sampled pixels over each item and group ``[P]``, ``[B, groups, 1, 1]`` each."""
+        items = self.nearness.shape[0]
+        zeros = self.nearness.new_zeros(len(parts), items * groups, dtype=widest_float(self.nearness.device))
+        found = zeros.index_add(1, self.item_of(sampled) * groups + group, torch.stack(parts).to(zeros.dtype))
+        return found.view(-1, items, groups, 1, 1).unbind(0)
 
 
 class _Sample(NamedTuple):
@@ -356,7 +358,7 @@ class _Errors(NamedTuple):
     doubtful: Tensor  # edge pixels that are decided, [B, 1, H, W]
     doubt: Tensor  # 0 to 1, how much the image contradicts the map, [B, 1, 1, 1]
     dilated: Tensor  # 0 to 1, how far a soft map's foregrounds are too wide, [B, 1, 1, 1]
-    resizing: Tensor  # -1, 0 or 1, of :func:`.resizing.resizing_of`, [B, 1, 1, 1]
+    edits: Tensor  # which edits colours ask for, of :func:`.registration.edits_of`, [B, EDITS, 1, 1]
 
 
 @torch.no_grad()
@@ -390,7 +392,7 @@ def _repair(
     errors = _errors_of(scene, sample, auto, is_related, ops)
     chosen = pixels.indices(errors.doubtful)
     if auto and is_empty(chosen):  # nor lamps: a soft map has ramps, which are selected
-        return nearness, torch.zeros_like(errors.doubt), errors.resizing
+        return nearness, torch.zeros_like(errors.doubt), errors.edits
     shown = judge(scene.looks, scene.nearness, chosen, errors.sharpness, False, of_coc, ops)
     shows_near = _decided(scene, errors, shown.score, chosen, auto)
     repaired = _moved(scene, errors, shown, shows_near, chosen)
@@ -403,7 +405,7 @@ def _repair(
         soft = Softness(errors.is_soft, sigma_of(scene.edges), lost / length, errors.doubt)
         repaired = lift_lamps(scene.light, scene.nearness, repaired, scene.step, soft, ops)
     repaired = torch.where(scene.valid, repaired, signed)
-    return -repaired if of_coc else repaired, errors.doubt - errors.dilated, errors.resizing
+    return -repaired if of_coc else repaired, errors.doubt - errors.dilated, errors.edits
 
 
 def _errors_of(scene: _Map, sample: _Sample, auto: bool, is_related: Tensor, ops: Ops) -> _Errors:
@@ -414,11 +416,12 @@ def _errors_of(scene: _Map, sample: _Sample, auto: bool, is_related: Tensor, ops
 
     kind = edge_search.kinds(edges)
     score = judge(scene.looks, scene.nearness, sampled, sharpness, True, False, ops).score
-    shares = calibrate(scene.light, pixels.pick(kind, sampled)[0], score)
+    kinds_sampled = pixels.pick(kind, sampled)[0]
+    shares = calibrate(scene.light, kinds_sampled, score)
     prior = shares[kind]
     none = scene.nearness.new_zeros(scene.nearness.shape[0], 1, 1, 1)
     if not auto:
-        return _Errors(is_soft, sharpness, prior, edges.is_edge, none, none, none)
+        return _Errors(is_soft, sharpness, prior, edges.is_edge, none, none, none.expand(-1, EDITS, -1, -1))
 
     # colour agrees with the map at clear pixels: in the outermost ring of a step, or near a ramp's ends; on one side of
     # the edges only where the map's foreground is too thin, and at half of them where it has no relation
@@ -426,14 +429,17 @@ def _errors_of(scene: _Map, sample: _Sample, auto: bool, is_related: Tensor, ops
     weight = weight_of(score) * torch.where(is_ramp > 0, (level - 0.5).abs() > _CLEAR_LEVEL, ring == RINGS)
     is_clear = weight * torch.stack([level > 0.5, level <= 0.5])  # of the near and of the far surface
     agrees = is_clear * ((score > 0) == (level > 0.5))
-    doubts, *sides = scene.sums(sampled, (1.0 - is_ramp) * pixels.pick(wrong, sampled)[0], *is_clear, *agrees)
-    clear, agreed = torch.stack(sides).chunk(2)
+    (doubts,) = scene.sums(sampled, (1.0 - is_ramp) * pixels.pick(wrong, sampled)[0])
+    direction = kinds_sampled % edge_search.DIRECTIONS
+    sides = scene.sums(sampled, *is_clear, *agrees, groups=edge_search.DIRECTIONS, group=direction)
+    clear_sides, agreed_sides = torch.stack(sides).chunk(2)
+    clear, agreed = (t.sum(2, keepdim=True) for t in (clear_sides, agreed_sides))
     assumed = 0.5 * PRIOR_COUNT  # pixels, half of which agree
     is_related = is_related | (agreed + 0.5 * assumed > _RELATED * (clear + assumed)).any(0)
-    resizing = none
-    if active().resizing:
-        resizing = resizing_of(clear, agreed, shares, is_soft).to(dtype)
-        is_related = is_related | (resizing != 0)
+    edits = none.expand(-1, EDITS, -1, -1)
+    if active().registration:
+        edits = edits_of(clear_sides, agreed_sides, shares, is_soft).to(dtype)
+        is_related = is_related | (edits > 0).any(1, keepdim=True)
     is_soft = is_soft & is_related
     is_inexact = is_related & (is_soft | (doubts > _EXACT * steps))
     doubtful = edges.is_edge & is_inexact & torch.where(edges.is_ramp, is_soft, wrong > _DOUBTFUL)
@@ -442,7 +448,7 @@ def _errors_of(scene: _Map, sample: _Sample, auto: bool, is_related: Tensor, ops
     faded = in_doubt * (softness - 1.0).clamp(0.0, 1.0)
     doubt = faded.to(dtype) if active().in_doubt else none
     dilated = dilated.to(dtype) if active().dilated else none
-    return _Errors(is_soft, sharpness, prior, doubtful, doubt, dilated, resizing)
+    return _Errors(is_soft, sharpness, prior, doubtful, doubt, dilated, edits)
 
 
 def _decided(scene: _Map, errors: _Errors, score: Tensor, chosen: Tensor, auto: bool) -> Tensor:
@@ -509,5 +515,5 @@ def _empty(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bo
 # The number of pixels to process depends on the data, which compiled graphs do not support.
 @one_operator("torchdof::repair_edges", _empty)
 def _operator(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool) -> tuple[Tensor, Tensor]:
-    repaired, doubt = from_resized(lambda resized, _: _repair(image, resized, step, auto, of_coc), nearness, of_coc)
+    repaired, doubt = registered(lambda edited, _: _repair(image, edited, step, auto, of_coc), nearness, of_coc)
     return repaired.clone(), doubt
