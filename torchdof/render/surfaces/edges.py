@@ -42,7 +42,7 @@ from .edge_colours import (
     more_blurred,
 )
 from .edge_prior import PRIOR_COUNT, weight_of
-from .edge_search import REACH, RINGS, Edges
+from .edge_search import DIRECTIONS, REACH, RINGS, Edges
 from .missed import completed
 from .registration import EDITS, Repaired, edits_of, registered
 from .soft_maps import Softness, lift_lamps, sigma_of, without_ringing
@@ -321,12 +321,12 @@ class _Map(NamedTuple):
         rows, columns = (_from_border(n, self.nearness.device) // _BLOCK for n in (height, width))
         return pixels.indices(self.edges.is_edge & ((rows[:, None] + columns) % every == 0))
 
-    def sums(self, sampled: Tensor, *parts: Tensor, groups: int = 1, group: Tensor | int = 0) -> tuple[Tensor, ...]:
-        """Sums of values ``[P]`` of sampled pixels over each item and group ``[P]``, ``[B, groups, 1, 1]`` each."""
+    def sums(self, sampled: Tensor, *parts: Tensor, groups: int = 1, group: Tensor | int = 0) -> Tensor:
+        """Sums of values ``[P]`` of sampled pixels over each item and group ``[P]``, ``[parts, B, groups, 1, 1]``."""
         items = self.nearness.shape[0]
         zeros = self.nearness.new_zeros(len(parts), items * groups, dtype=widest_float(self.nearness.device))
         found = zeros.index_add(1, self.item_of(sampled) * groups + group, torch.stack(parts).to(zeros.dtype))
-        return found.view(-1, items, groups, 1, 1).unbind(0)
+        return found.view(-1, items, groups, 1, 1)
 
 
 class _Sample(NamedTuple):
@@ -345,7 +345,7 @@ class _Sample(NamedTuple):
         edges, chosen = scene.edges, scene.sample()
         maps = [edges.level, edges.climb, edges.is_ramp, edges.ring]
         level, climb, is_ramp, ring = pixels.pick(torch.cat([t.to(edges.level.dtype) for t in maps], 1), chosen)
-        mixed, length, steps = scene.sums(chosen, is_ramp * _mixture(level), climb, 1.0 - is_ramp)
+        mixed, length, steps = scene.sums(chosen, is_ramp * _mixture(level), climb, 1.0 - is_ramp).unbind()
         return cls(chosen, level, is_ramp, ring, steps, mixed / (_SOFT * length.clamp_min(1e-12)))
 
 
@@ -429,19 +429,17 @@ def _errors_of(scene: _Map, sample: _Sample, auto: bool, is_related: Tensor, ops
     weight = weight_of(score) * torch.where(is_ramp > 0, (level - 0.5).abs() > _CLEAR_LEVEL, ring == RINGS)
     is_clear = weight * torch.stack([level > 0.5, level <= 0.5])  # of the near and of the far surface
     agrees = is_clear * ((score > 0) == (level > 0.5))
-    (doubts,) = scene.sums(sampled, (1.0 - is_ramp) * pixels.pick(wrong, sampled)[0])
-    direction = kinds_sampled % edge_search.DIRECTIONS
-    sides = scene.sums(sampled, *is_clear, *agrees, groups=edge_search.DIRECTIONS, group=direction)
-    clear_sides, agreed_sides = torch.stack(sides).chunk(2)
-    clear, agreed = (t.sum(2, keepdim=True) for t in (clear_sides, agreed_sides))
+    doubts = (1.0 - is_ramp) * pixels.pick(wrong, sampled)[0]
+    directions = scene.sums(sampled, doubts, *is_clear, *agrees, groups=DIRECTIONS, group=kinds_sampled % DIRECTIONS)
+    doubts, clear, agreed = directions.sum(2, keepdim=True).split([1, 2, 2])
     assumed = 0.5 * PRIOR_COUNT  # pixels, half of which agree
     is_related = is_related | (agreed + 0.5 * assumed > _RELATED * (clear + assumed)).any(0)
     edits = none.expand(-1, EDITS, -1, -1)
     if active().registration:
-        edits = edits_of(clear_sides, agreed_sides, shares, is_soft).to(dtype)
+        edits = edits_of(directions[1:3], directions[3:], shares, is_soft).to(dtype)
         is_related = is_related | (edits > 0).any(1, keepdim=True)
     is_soft = is_soft & is_related
-    is_inexact = is_related & (is_soft | (doubts > _EXACT * steps))
+    is_inexact = is_related & (is_soft | (doubts[0] > _EXACT * steps))
     doubtful = edges.is_edge & is_inexact & torch.where(edges.is_ramp, is_soft, wrong > _DOUBTFUL)
     in_doubt, dilated = (torch.where(is_soft, found, 0.0) for found in doubt_of(clear, agreed))
     # ramps of a pixel are means over pixels, or artefacts of compression: there is little to doubt

@@ -31,7 +31,7 @@ _WIDE, _WIDE_FAR = 0.3, 0.06  # those of near and far side above which they are 
 _MOST_PX = 6  # px; by which foregrounds are resized, or a map is shifted, at most
 _SIDES = (0, 1, 3, 4)  # directions towards the near surface: at the edge below it, to its right, to its left, above it
 
-EDITS = 2 + len(_SIDES)
+EDITS = 6
 """Number of edits: dilated foregrounds, eroded ones, maps shifted down, right, left, and up."""
 
 _ANY = 2.0  # stands for each edit before the first repair. Later 1: is done now, 0: is not, -1: never again
@@ -65,14 +65,10 @@ def edits_of(clear: Tensor, agreed: Tensor, prior: Tensor, is_soft: Tensor) -> T
     is_wide = (near > _WIDE) & (near > OF_OTHER * far) & (far > _WIDE_FAR)
     is_wide = is_wide | (~is_soft & (excess.amax(1, keepdim=True) < -_RESIZED))  # bright things have too wide ramps
     near_apart, far_apart = contradicted(clear, agreed)
-    is_shifted = _is_shifted(excess) | _is_shifted(far_apart - near_apart)
-    return torch.cat([is_thin, is_wide, is_shifted], 1).to(near.dtype)
-
-
-def _is_shifted(excess: Tensor) -> Tensor:
-    """Whether opposite sides, with an excess ``[B, DIRECTIONS, 1, 1]``, must both move towards each of ``_SIDES``."""
-    outward, inward = (t[:, list(_SIDES)] for t in (excess, -excess.flip(1)))
-    return (torch.minimum(outward, inward) > _ONE_SIDE) & (0.5 * (outward + inward) > _SHIFTED)
+    both = torch.stack([excess, (far_apart - near_apart).to(excess.dtype)])
+    outward, inward = (t[:, :, list(_SIDES)] for t in (both, -both.flip(2)))  # of opposite sides
+    is_shifted = (torch.minimum(outward, inward) > _ONE_SIDE) & (0.5 * (outward + inward) > _SHIFTED)
+    return torch.cat([is_thin, is_wide, is_shifted.any(0)], 1).to(near.dtype)
 
 
 def registered(
@@ -108,7 +104,7 @@ def registered(
     if is_traced():
         state, times = (nearness, nearness, edits[:, :1], edits), _MOST_PX + 1
     else:
-        state, times = (nearness, *once(nearness, _following(edits))), _MOST_PX
+        state, times = (nearness, *once(nearness, edits > 0)), _MOST_PX
         if not state[-1].any():
             return state[1:3]
     _, repaired, doubt, _ = ops.repeated(step, state, times)
