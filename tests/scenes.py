@@ -462,7 +462,7 @@ def resized_post(spread: float, by_px: int, widths: Sequence[int]) -> tuple[Tens
 
 
 def shifted_disc(spread: float, right: int, down: int, widths: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
-    """An image of a disc, a map of the coc in which it is shifted by so many pixels, and the exact map.
+    """An image of a disc, a map of the coc that is moved by ``right`` and ``down`` pixels, and the exact map.
 
     Other arguments as for :func:`resized_post`.
     """

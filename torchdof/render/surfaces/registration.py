@@ -2,8 +2,8 @@
 
 A repair learns how often a map is wrong beside its edges, and corrects this within a window of a few pixels. From what
 it learns one also sees in which direction the edges of each side must move: all outward where foregrounds are too thin,
-all inward where they are too wide, left and right ones in the same direction where the map is shifted. Foregrounds are
-then dilated or eroded, or the map is shifted, by a pixel at a time as long as colours ask for it. The repair that
+all inward where they are too wide, those of opposite sides in the same direction where the map is shifted. Foregrounds
+are then dilated or eroded, or the map is shifted, by a pixel at a time as long as colours ask for it. The repair that
 follows has smaller errors to correct.
 """
 
@@ -45,7 +45,7 @@ def edits_of(clear: Tensor, agreed: Tensor, prior: Tensor, is_soft: Tensor) -> T
 
     The excess of the near surface at edges of one direction is the share of far pixels that show the near surface, less
     that of near pixels that show the far one: -1 to 1, positive where these edges must move outward. On ramps, twice
-    the mean share of the near surface, less 1, is the same. Clear pixels, farther from the edges, tell larger errors.
+    the mean share of the near surface, less 1, is the same. Clear pixels, farther from the edges, show larger errors.
 
     Args:
         clear: As for :func:`.doubt.doubt_of`, ``[2, B, DIRECTIONS, 1, 1]``.
@@ -77,8 +77,8 @@ def registered(
     """Repairs a map after the edits that colours ask for.
 
     Args:
-        once: Repairs a map. Its second argument tells which edits may follow, ``[B, EDITS, 1, 1]``. If colours ask for
-            one of them, only the third result counts; never with None.
+        once: Repairs a map. Its second argument has the edits that may follow, ``[B, EDITS, 1, 1]``, or is None. If
+            colours ask for one of them, only the third result counts.
         nearness: The map, ``[B, 1, H, W]``.
         of_coc: Whether it is a map of the coc instead, in which a larger value is farther.
         ops: Repeats the repair.
@@ -131,7 +131,7 @@ def _resized(nearness: Tensor, sign: float) -> Tensor:
 
 
 def _shifted(nearness: Tensor, right: int, down: int) -> Tensor:
-    """A map that moves by so many pixels, -1 to 1. Invalid values stay, and so do those that would become invalid."""
+    """A map moved by ``right`` and ``down`` pixels, -1 to 1. Values that are invalid, or would become so, stay."""
     height, width = nearness.shape[-2:]
     padded = functional.pad(nearness, (1, 1, 1, 1), mode="replicate")
     moved = padded.narrow(-2, 1 - down, height).narrow(-1, 1 - right, width)
