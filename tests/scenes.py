@@ -450,15 +450,9 @@ def resized_post(spread: float, by_px: int, widths: Sequence[int]) -> tuple[Tens
     Light of the post and of its background varies by ``spread``, the standard deviation of its logarithm. Means over
     each of ``widths`` pixels, one after the other, soften the map; without any it is hard.
     """
-    generator = torch.Generator().manual_seed(0)
     columns, rows = torch.arange(160), torch.arange(224)[:, None]
     beside = (columns - 70 + 0.3 * (rows - 112)).abs() - 20
-    light = torch.where(beside < 0, 0.25, 0.6) * torch.exp(spread * torch.randn(beside.shape, generator=generator))
-    soft = torch.where(beside < by_px, -12.0, 0.5).expand(1, 1, -1, -1)
-    for side in widths:
-        soft = mean_around(soft, side // 2)
-    exact = torch.where(beside < 0, -12.0, 0.5)[None, None]
-    return light.expand(1, 3, -1, -1).contiguous(), soft.contiguous(), exact
+    return _before_background(beside < 0, beside < by_px, spread, widths)
 
 
 def shifted_disc(spread: float, right: int, down: int, widths: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
@@ -466,11 +460,17 @@ def shifted_disc(spread: float, right: int, down: int, widths: Sequence[int]) ->
 
     Other arguments as for :func:`resized_post`.
     """
-    generator = torch.Generator().manual_seed(0)
     is_disc = (torch.arange(192) - 90).square() + (torch.arange(176)[:, None] - 80).square() < 60**2
-    light = torch.where(is_disc, 0.25, 0.6) * torch.exp(spread * torch.randn(is_disc.shape, generator=generator))
-    exact = torch.where(is_disc, -12.0, 0.5)[None, None]
-    given = exact.roll((down, right), (-2, -1))
+    return _before_background(is_disc, is_disc.roll((down, right), (-2, -1)), spread, widths)
+
+
+def _before_background(
+    is_near: Tensor, is_given: Tensor, spread: float, widths: Sequence[int]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The image where ``is_near [H, W]`` is in front, the map where ``is_given`` is, softened, and the exact map."""
+    generator = torch.Generator().manual_seed(0)
+    light = torch.where(is_near, 0.25, 0.6) * torch.exp(spread * torch.randn(is_near.shape, generator=generator))
+    exact, given = (torch.where(near, -12.0, 0.5)[None, None] for near in (is_near, is_given))
     for side in widths:
         given = mean_around(given, side // 2)
     return light.expand(1, 3, -1, -1).contiguous(), given.contiguous(), exact

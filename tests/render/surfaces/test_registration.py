@@ -163,9 +163,8 @@ def test_an_edit_is_never_undone_and_the_last_one_ends() -> None:
     def once(nearness: Tensor, following: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         told.append(None if following is None else [f.flatten().nonzero().flatten().tolist() for f in following])
         edits = torch.zeros(3, EDITS, 1, 1)
-        edits[0, THIN] = edits[1, THIN if len(told) == 1 else WIDE] = edits[2, TO_LEFT if len(told) < 3 else TO_UP] = (
-            1.0
-        )
+        for item, edit in enumerate([THIN, THIN if len(told) == 1 else WIDE, TO_LEFT if len(told) < 3 else TO_UP]):
+            edits[item, edit] = 1.0
         return nearness + 0.5, torch.full((3, 1, 1, 1), float(len(told))), edits
 
     point = torch.zeros(3, 1, 32, 32)

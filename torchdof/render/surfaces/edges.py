@@ -420,8 +420,9 @@ def _errors_of(scene: _Map, sample: _Sample, auto: bool, is_related: Tensor, ops
     shares = calibrate(scene.light, kinds_sampled, score)
     prior = shares[kind]
     none = scene.nearness.new_zeros(scene.nearness.shape[0], 1, 1, 1)
+    edits = none.expand(-1, EDITS, -1, -1)
     if not auto:
-        return _Errors(is_soft, sharpness, prior, edges.is_edge, none, none, none.expand(-1, EDITS, -1, -1))
+        return _Errors(is_soft, sharpness, prior, edges.is_edge, none, none, edits)
 
     # colour agrees with the map at clear pixels: in the outermost ring of a step, or near a ramp's ends; on one side of
     # the edges only where the map's foreground is too thin, and at half of them where it has no relation
@@ -434,7 +435,6 @@ def _errors_of(scene: _Map, sample: _Sample, auto: bool, is_related: Tensor, ops
     doubts, clear, agreed = directions.sum(2, keepdim=True).split([1, 2, 2])
     assumed = 0.5 * PRIOR_COUNT  # pixels, half of which agree
     is_related = is_related | (agreed + 0.5 * assumed > _RELATED * (clear + assumed)).any(0)
-    edits = none.expand(-1, EDITS, -1, -1)
     if active().registration:
         edits = edits_of(directions[1:3], directions[3:], shares, is_soft).to(dtype)
         is_related = is_related | (edits > 0).any(1, keepdim=True)
