@@ -276,6 +276,7 @@ void check_edges(unsigned seed) {
                               int(seed) % 7 == 0,
                               int(seed) % 4 == 0,
                               int(seed) % 4 - 1,
+                              int(seed) % 3 == 0,
                               threads,
                               &never,
                               out.data()};

@@ -409,6 +409,7 @@ def repair_edges(
     stops_if_wide: bool = False,
     is_related: bool = False,
     stops: int = 0,
+    eroded: bool = False,
 ) -> tuple[Tensor, float, bool, int]:
     """Repairs the edges of a depth map, as :func:`torchdof.render.surfaces.edges.repair`, for one image.
 
@@ -416,12 +417,13 @@ def repair_edges(
     input itself if it needs no repair, how much it is in doubt, 0 to 1, less how far its foregrounds are dilated, 0 to
     1, whether the repair has stopped because of ramps too wide to be found, with ``stops_if_wide``, and which edits of
     the map colours ask for, of :func:`torchdof.render.surfaces.registration.edits_of`, a bit each. The map stays as it
-    is if they ask for one of ``stops``. ``is_related``: the colours are known to be related to the map.
+    is if they ask for one of ``stops``. ``is_related``: the colours are known to be related to the map. ``eroded``: its
+    foregrounds were too wide and have been eroded.
     """
     steps = (None, float(step)) if step.ndim == 0 else (step, 0.0)
     out, doubt = _empty(*nearness.shape), ctypes.c_double(0.0)
     changed, edits = ctypes.c_int32(0), ctypes.c_int32(0)
-    options = (of_coc, *steps, auto, stops_if_wide, is_related, stops)
+    options = (of_coc, *steps, auto, stops_if_wide, is_related, stops, eroded)
     _of_map("repair_edges", light, nearness, options, out, changed, doubt, edits)
     return out if changed.value == 1 else nearness, doubt.value, changed.value == _STOPPED, edits.value
 
@@ -433,7 +435,7 @@ def missed_parts(light: Tensor, coc_px: Tensor) -> tuple[Tensor, float]:
     is, ``[2, H, W]``, and how far the map has missed parts, 0 to 1.
     """
     out, share = _empty(2, *coc_px.shape), ctypes.c_double(0.0)
-    _of_map("missed_parts", light, coc_px, (True, None, 0.0, *(False,) * 4), out, share)
+    _of_map("missed_parts", light, coc_px, (True, None, 0.0, *(False,) * 5), out, share)
     return out, share.value
 
 

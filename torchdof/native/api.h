@@ -122,6 +122,7 @@ typedef struct {
   int32_t stops_if_wide;  // 1: leave a map with ramps too wide to be found unchanged, with `changed` = 2
   int32_t is_related;     // 1: the colours are known to be related to the map
   int32_t stops;          // bits of the edits for which to leave a map unchanged, if colours ask for one of them
+  int32_t eroded;         // 1: foregrounds were too wide and have been eroded
   int32_t threads;
   const volatile int32_t *cancelled;
   float *out;  // [height, width]
@@ -132,7 +133,7 @@ typedef struct {
 // a bit each, in the order of render/surfaces/registration.py.
 TORCHDOF_API int32_t torchdof_repair_edges(const torchdof_map *map, int32_t *changed, double *doubt, int32_t *edits);
 
-// Gives missed fine parts of blurred foregrounds to them, in a map of coc; reads no members from steps to stops. out
+// Gives missed fine parts of blurred foregrounds to them, in a map of coc; reads no members from steps to eroded. out
 // is [2, height, width]: the map, and how unlike the background each pixel is, 0 to 1; 1 where none is known. share:
 // how far the map has missed parts, 0 to 1.
 TORCHDOF_API int32_t torchdof_missed_parts(const torchdof_map *map, double *share);

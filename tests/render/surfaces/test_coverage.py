@@ -77,7 +77,7 @@ def test_both_surfaces_of_an_uneven_scene_have_the_recorded_coc() -> None:
     assert means == pytest.approx([0.23652, -1.19772, 0.18584], abs=2e-5)
 
 
-@pytest.mark.parametrize(("shift", "gain_db"), [(0, 6.0), (2, 14.0), (-2, 14.0)])
+@pytest.mark.parametrize(("shift", "gain_db"), [(0, 6.0), (2, 2.0), (-2, 14.0)])
 def test_true_coverage_renders_strands_before_a_wall_in_focus(shift: int, gain_db: float, engine: str) -> None:
     """A strand may have the colour of the wall, and a displaced map has strands in other places."""
     image, coc, cover, truth = scene(shift)

@@ -45,27 +45,19 @@ def test_blur_only_rises_and_each_pixel_keeps_its_side_of_the_focus() -> None:
 
 
 @pytest.mark.parametrize(
-    ("near", "far", "doubt", "dilated"),
-    [
-        (0.0, 0.9, 0, 0),
-        (0.9, 0.0, 0, 1),
-        (0.2, 0.1, 1, 0),
-        (0.02, 0.3, 0, 0),
-        (0.04, 0.04, 0.6, 0),
-        (0.5, 0.05, 0, 1),
-    ],
+    ("near", "far", "doubt"), [(0.0, 0.9, 0), (0.9, 0.0, 0), (0.2, 0.1, 1), (0.02, 0.3, 0), (0.04, 0.04, 0.6)]
 )
 def test_a_map_is_in_doubt_if_both_sides_of_its_edges_are_contradicted_alike(
-    near: float, far: float, doubt: float, dilated: float
+    near: float, far: float, doubt: float
 ) -> None:
     clear = torch.tensor([[1e4], [1e4]])
     found = doubt_of(clear, clear * (1.0 - torch.tensor([[near], [far]])))
-    assert_close(torch.cat(found), torch.tensor([doubt, dilated]).float(), atol=0.1, rtol=0)
+    assert_close(found, torch.tensor([doubt]).float(), atol=0.1, rtol=0)
 
 
 def test_few_pixels_say_nothing_of_a_map() -> None:
     clear = torch.tensor([[3.0], [3.0]])
-    assert not torch.cat(doubt_of(clear, 0.9 * clear)).any()
+    assert not doubt_of(clear, 0.9 * clear).any()
 
 
 @pytest.mark.parametrize("spread", [0.02, 0.25])

@@ -90,10 +90,13 @@ def few_and_many(few: float, many: float, *directions: int) -> list[float]:
         ((0.0, 0.0), [0.9] * 5, few_and_many(0.1, 0.6, LEFT), []),
         ((0.0, 0.0), [0.9] * 5, [0.9] * 5, []),
         ((0.1, 0.5), [0.3] * 5, [0.1] * 5, [THIN]),
+        ((0.1, 0.3), [0.3] * 5, [0.3] * 5, [THIN]),
         ((0.1, 0.5), few_and_many(0.9, 0.1, LEFT), [0.1] * 5, []),
         ((0.4, 0.5), [0.1] * 5, [0.1] * 5, []),
         ((0.5, 0.1), [0.1] * 5, [0.1] * 5, [WIDE]),
-        ((0.5, 0.0), [0.1] * 5, [0.1] * 5, []),
+        ((0.4, 0.1), [0.3] * 5, [0.1] * 5, [WIDE]),
+        ((0.25, 0.1), [0.3] * 5, [0.1] * 5, []),
+        ((0.5, 0.1), few_and_many(0.1, 0.9, LEFT), [0.1] * 5, []),
         ((0.0, 0.0), few_and_many(0.1, 0.5, LEFT), few_and_many(0.1, 0.5, RIGHT), [TO_RIGHT]),
         ((0.0, 0.0), few_and_many(0.1, 0.5, RIGHT), few_and_many(0.1, 0.5, LEFT), [TO_LEFT]),
         ((0.0, 0.0), few_and_many(0.1, 0.5, UP, LEFT), few_and_many(0.1, 0.5, DOWN, RIGHT), [TO_DOWN, TO_RIGHT]),
@@ -117,6 +120,8 @@ def test_steps_of_a_hard_map_tell_its_edits(
         ((0.0, 0.0), [0.2] * 5, []),
         ((0.1, 0.5), [0.5] * 5, [THIN]),
         ((0.5, 0.1), [0.5] * 5, [WIDE]),
+        ((0.4, 0.5), [0.5] * 5, []),
+        ((0.5, 0.1), few_and_many(0.5, 0.8, UP), []),
         ((0.0, 0.0), [0.5, 0.6, 0.5, 0.4, 0.5], [TO_RIGHT]),
         ((0.0, 0.0), [0.4, 0.4, 0.5, 0.6, 0.6], [TO_LEFT, TO_UP]),
         ((0.0, 0.0), [0.6, 0.5, 0.5, 0.5, 0.5], []),
@@ -136,7 +141,8 @@ def found(contradicted: Tensor, prior: Tensor, is_soft: bool) -> list[int]:
     """The edits for shares of clear pixels that contradict a map, ``[2, DIRECTIONS]``: near and far ones."""
     weights = torch.full((2, 1, edge_search.DIRECTIONS, 1, 1), 1e4)
     agreed = weights * (1.0 - contradicted[:, None, :, None, None])
-    return edits_of(weights, agreed, prior, torch.tensor([[[[is_soft]]]])).flatten().nonzero().flatten().tolist()
+    edits, _ = edits_of(weights, agreed, prior, torch.tensor([[[[is_soft]]]]))
+    return edits.flatten().nonzero().flatten().tolist()
 
 
 @pytest.mark.parametrize("is_soft", [False, True])
@@ -156,11 +162,22 @@ def test_clear_pixels_tell_larger_shifts(near: list[float], far: list[float], ed
     assert found(torch.tensor([near, far]), prior, is_soft) == edits
 
 
+@pytest.mark.parametrize(
+    ("on_ramps", "dilated"),
+    [([0.5] * 5, 0.0), ([0.34] * 5, 0.2), ([0.29] * 5, 1.0), (few_and_many(0.1, 0.4, LEFT), 0.0), ([0.9] * 5, 0.0)],
+)
+def test_ramps_of_each_direction_tell_dilated_foregrounds(on_ramps: list[float], dilated: float) -> None:
+    clear = torch.full((2, 2, edge_search.DIRECTIONS, 1, 1), 1e4)
+    prior = priors([0.0] * 5, [0.0] * 5, on_ramps).repeat(2)
+    _, found = edits_of(clear, clear, prior, torch.tensor([True, False]).view(2, 1, 1, 1))
+    assert_close(found.flatten(), torch.tensor([dilated, 0.0]), atol=1e-5, rtol=0)
+
+
 def test_an_edit_is_never_undone_and_the_last_one_ends() -> None:
     """A map that asks for the opposite is repaired as it is; one that asks forever is edited a few times."""
     told: list[list[list[int]] | None] = []
 
-    def once(nearness: Tensor, following: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    def once(nearness: Tensor, eroded: Tensor, following: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         told.append(None if following is None else [f.flatten().nonzero().flatten().tolist() for f in following])
         edits = torch.zeros(3, EDITS, 1, 1)
         for item, edit in enumerate([THIN, THIN if len(told) == 1 else WIDE, TO_LEFT if len(told) < 3 else TO_UP]):
@@ -177,6 +194,34 @@ def test_an_edit_is_never_undone_and_the_last_one_ends() -> None:
     sides = [TO_DOWN, TO_LEFT, TO_UP]
     assert told[:3] == [[[*range(EDITS)]] * 3, [[THIN], [THIN], sides], [[THIN], [], sides]]
     assert told[3:] == [*[[[THIN], [], [TO_LEFT, TO_UP]]] * (most - 3), None]
+
+
+@pytest.mark.parametrize("of_coc", [False, True])
+def test_wires_are_not_eroded(of_coc: bool) -> None:
+    sign = -1.0 if of_coc else 1.0
+    given = torch.zeros(1, 1, 32, 32)
+    given[..., 4:12, 4:12], given[..., 20:22, :], given[..., 28, 9] = 1.0, 2.0, torch.nan
+    dilated, eroded = (sign * edit(sign * given) for edit in registration._edits(of_coc)[:2])
+    assert bool((dilated[..., 3:13, 3:13] == 1.0).all())
+    assert bool((dilated[..., 19:23, :] == 2.0).all())
+    expected = given.clone()
+    expected[..., 4:12, 4:12] = 0.0
+    expected[..., 5:11, 5:11] = 1.0
+    assert_close(eroded, expected, atol=1e-6, rtol=0, equal_nan=True)
+
+
+def test_a_repair_learns_of_eroded_foregrounds() -> None:
+    told: list[list[bool]] = []
+
+    def once(nearness: Tensor, eroded: Tensor, following: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+        told.append(eroded.flatten().tolist())
+        edits = torch.zeros(3, EDITS, 1, 1)
+        for item, edit in enumerate([THIN, WIDE, TO_LEFT]):
+            edits[item, edit] = float(len(told) < 3)
+        return nearness, torch.zeros(3, 1, 1, 1), edits
+
+    registered(once, torch.zeros(3, 1, 32, 32), False)
+    assert told == [[False] * 3, [False, True, False], [False, True, False]]
 
 
 @pytest.mark.parametrize(
@@ -205,6 +250,18 @@ def test_the_engine_repairs_a_map_that_is_not_to_be_edited_that_way(by_px: int) 
         repair = native.repair_edges(image[0], given[0, 0], torch.tensor(1.0), True, True, stops=stops)
         assert repair[3] == 1 << edit
         assert_close(repair[0], (given if stops >> edit & 1 else expected[0])[0, 0], atol=1e-3, rtol=0)
+
+
+@COMPILED
+def test_engines_agree_on_a_map_whose_foregrounds_are_eroded() -> None:
+    image, given, _ = resized_post(0.25, 1, [5])
+    eroded, step = torch.ones(1, 1, 1, 1, dtype=torch.bool), torch.tensor(edges.STEP_PX)
+    for told in (eroded, ~eroded):
+        repaired, doubt, _ = edges._repair(image, given, step, True, True, eroded=told)
+        own, its_doubt, *_ = native.repair_edges(image[0], given[0, 0], step, True, True, eroded=bool(told))
+        assert_close(own, repaired[0, 0], atol=1e-3, rtol=0)
+        assert its_doubt == pytest.approx(float(doubt))
+        assert (float(doubt) == -1.0) == bool(told)
 
 
 @pytest.mark.parametrize("by_px", [-4, 5])

@@ -26,12 +26,10 @@ namespace {
 using namespace constants::edge_prior;
 using namespace constants::edges;  // render/surfaces/edges.py gives meanings, units and effects
 using constants::doubt::ASSUMED, constants::doubt::CONTRADICTED, constants::doubt::OFTEN_CONTRADICTED;
-using constants::doubt::MUCH_DILATED, constants::doubt::OF_OTHER;
 using constants::edge_colours::SHARPNESS, constants::edge_colours::SOFT_SHARPNESS;
 using constants::edge_search::LEVELS;
-using constants::registration::ONE_SIDE, constants::registration::RESIZED, constants::registration::SHIFTED,
-    constants::registration::SIDES;
-using constants::registration::THIN, constants::registration::WIDE_FAR;
+using constants::registration::DILATED, constants::registration::ONE_SIDE, constants::registration::RESIZED,
+    constants::registration::SHIFTED, constants::registration::SIDES, constants::registration::THIN;
 
 // Weights of the clearest edge pixels of far surfaces and of near ones, and of those that have the right colour: of
 // all, and by direction.
@@ -90,8 +88,11 @@ class Repair : Planes, EdgeMap {
     judge_edges(*this, sampled, false, sharpness);
     calibrate(sampled);
     const Agreement agreement = agreement_of(sampled);
+    float dilated = 0.0f;
     if (map_.automatic) {
-      edits = edits_of(agreement, is_soft);
+      const Edits asked = edits_of(agreement, is_soft);
+      edits = asked.bits;
+      dilated = is_soft && map_.eroded ? 1.0f : asked.dilated;
       if (edits & map_.stops) return UNCHANGED;
       if (!(map_.is_related || edits || is_related(agreement)) || !(is_soft || is_inexact(sampled))) return UNCHANGED;
     }
@@ -103,8 +104,9 @@ class Repair : Planes, EdgeMap {
     else
       choose_edges(groups, [&](const Edge &edge) { return doubtful[given_kind_of(edge)]; });
     judge_edges(*this, groups, true, sharpness);
-    const auto [in_doubt, dilated] = map_.automatic && is_soft ? doubt_of(agreement) : Doubt{};
-    const float faded = in_doubt * clamp01((float)softness - 1.0f);
+    // ramps of a pixel are means over pixels, or artefacts of compression: there is little to doubt
+    const float in_doubt = map_.automatic && is_soft ? doubt_of(agreement) * (1.0f - dilated) : 0.0f,
+                faded = in_doubt * clamp01((float)softness - 1.0f);
     const float lost_px = move(groups, is_soft, faded, dilated);
     if (is_soft) remove_ringing(*this);
     if (is_soft && faded < 1) lift_lamps(*this, sigma_of(found_), lost_px, faded);
@@ -229,8 +231,9 @@ class Repair : Planes, EdgeMap {
     return agrees(false) || agrees(true);
   }
 
-  struct Doubt {
-    float in_doubt, dilated;
+  struct Edits {
+    int bits;
+    float dilated;
   };
 
   // render/surfaces/doubt.py, contradicted: of the near side, or the far one.
@@ -239,16 +242,13 @@ class Repair : Planes, EdgeMap {
   }
 
   // render/surfaces/doubt.py, doubt_of.
-  static Doubt doubt_of(const Agreement &found) {
-    const float near = contradicted(found.all, true), far = contradicted(found.all, false);
-    const float doubt = clamp01((std::min(near, far) - CONTRADICTED) / (OFTEN_CONTRADICTED - CONTRADICTED));
-    const float dilated =
-        clamp01((near - OF_OTHER * far - constants::doubt::DILATED) / (MUCH_DILATED - constants::doubt::DILATED));
-    return {doubt * (1.0f - dilated), dilated};
+  static float doubt_of(const Agreement &found) {
+    const float share = std::min(contradicted(found.all, true), contradicted(found.all, false));
+    return clamp01((share - CONTRADICTED) / (OFTEN_CONTRADICTED - CONTRADICTED));
   }
 
-  // render/surfaces/registration.py, edits_of: a bit for each edit.
-  int edits_of(const Agreement &found, bool is_soft) const {
+  // render/surfaces/registration.py, edits_of: a bit for each edit, and how far foregrounds of a soft map are dilated.
+  Edits edits_of(const Agreement &found, bool is_soft) const {
     float beside[DIRECTIONS], apart[DIRECTIONS], least_far = 1;
     for (int d = 0; d < DIRECTIONS; d++) {
       float share = 0;
@@ -258,11 +258,10 @@ class Repair : Planes, EdgeMap {
       least_far = std::min(least_far, shares_[d]);
     }
     const auto [least, most] = std::minmax_element(beside, beside + DIRECTIONS);
-    const float near = contradicted(found.all, true), far = contradicted(found.all, false);
-    const bool is_thin =
-                   far > THIN && far > OF_OTHER * near && (is_soft || least_far > constants::registration::BESIDE),
-               is_wide = near > constants::registration::WIDE && near > OF_OTHER * far && far > WIDE_FAR;
-    int edits = (is_thin || *least > RESIZED) + 2 * (is_wide || (!is_soft && *most < -RESIZED));
+    const float clear = contradicted(found.all, false) - contradicted(found.all, true);
+    const bool is_thin = *least > RESIZED || (clear > THIN && (is_soft || least_far > constants::registration::BESIDE)),
+               is_wide = (-clear > constants::registration::WIDE && *most < RESIZED) || (!is_soft && *most < -RESIZED);
+    int edits = is_thin + 2 * is_wide;
     for (int k = 0; k < (int)std::size(SIDES); k++) {
       const int side = SIDES[k], other = DIRECTIONS - 1 - side;
       const auto moves = [&](const float *excess) {
@@ -271,7 +270,7 @@ class Repair : Planes, EdgeMap {
       };
       if (moves(beside) || moves(apart)) edits |= 4 << k;
     }
-    return edits;
+    return {edits, is_soft ? clamp01((-*most - DILATED) / (RESIZED - DILATED)) : 0.0f};
   }
 
   // Share of pixels that show the near surface, by kind: a maximum-likelihood fit (EM) to the scores, with PRIOR_COUNT

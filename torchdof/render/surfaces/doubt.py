@@ -20,16 +20,11 @@ from ..engines.ops import EAGER, Ops
 from ..rules import active
 from .windows import LARGEST, NEVER, highest, mean_around
 
-__all__ = ["OF_OTHER", "blurred_in_doubt", "contradicted", "doubt_of", "hiding_px"]
-
-OF_OTHER = 1.5
-"""Part of the other side's share that is taken off a side's; larger: only maps that err clearly on one side."""
+__all__ = ["blurred_in_doubt", "contradicted", "doubt_of", "hiding_px"]
 
 _CONTRADICTED = 0.03  # share of clear pixels that contradict the map, on either side, from which it is in doubt
 _OFTEN_CONTRADICTED = 0.045  # the same from which it is fully in doubt
 _ASSUMED = 15.0  # pixels that are assumed to agree with the map; larger: maps with few edges are trusted
-_DILATED = 0.05  # rest of the near side's share from which foregrounds are too wide
-_MUCH_DILATED = 0.15  # the same from which they fully count as too wide
 _MOVED_PX = 1.0  # px; change of the coc by which the repair of edges has half moved a pixel
 _REACH = 8  # px; distance from a blurred foreground at which its blur has faded; larger: fewer scraps, softer pictures
 _NEAR_FROM, _NEAR_SLOPE = 0.375, 4.0  # blur, over the largest around, above which a pixel is near; slope of this weight
@@ -56,22 +51,19 @@ def contradicted(clear: Tensor, agreed: Tensor) -> tuple[Tensor, Tensor]:
     return near, far
 
 
-def doubt_of(clear: Tensor, agreed: Tensor) -> tuple[Tensor, Tensor]:
-    """How much a map is in doubt, and how far its foregrounds are dilated.
+def doubt_of(clear: Tensor, agreed: Tensor) -> Tensor:
+    """How much a map is in doubt, 0 to 1, ``[...]``.
+
+    The less contradicted side counts, because colours of a map that is only too thin, or too wide, contradict it on one
+    side, and the repair of edges cures that.
 
     Args:
         clear: Weights of clear pixels of near and far surfaces, ``[2, ...]``.
         agreed: Those of pixels that have the colour of the surface that the map gives them.
-
-    Returns:
-        ``[...]`` each, 0 to 1. The doubt: the less contradicted side counts, because colours of a map that is only too
-        thin, or too wide, contradict it on one side, and the repair of edges cures that. And how far foregrounds are
-        dilated, too wide: the near side is contradicted much more than the far one.
     """
     near, far = contradicted(clear, agreed)
     doubt = (torch.minimum(near, far) - _CONTRADICTED) / (_OFTEN_CONTRADICTED - _CONTRADICTED)
-    dilated = ((near - OF_OTHER * far - _DILATED) / (_MUCH_DILATED - _DILATED)).clamp(0.0, 1.0)
-    return doubt.clamp(0.0, 1.0) * (1.0 - dilated), dilated
+    return doubt.clamp(0.0, 1.0)
 
 
 def blurred_in_doubt(given: Tensor, repaired: Tensor, unlike: Tensor, doubt: Tensor, ops: Ops = EAGER) -> Tensor:

@@ -192,7 +192,8 @@ def repair(
     Returns:
         ``[B, 1, H, W]``, constant to autograd; unchanged pixels keep their values to the bit. ``nearness`` itself if
         the compiled engine leaves all of it unchanged. And how much the map, registered, is in doubt, 0 to 1, less how
-        far its foregrounds are dilated, 0 to 1, ``[B, 1, 1, 1]``, both of :func:`.doubt.doubt_of`, in soft maps.
+        far its foregrounds are dilated, 0 to 1, ``[B, 1, 1, 1]``, of :func:`.doubt.doubt_of` and
+        :func:`.registration.edits_of`, in soft maps.
     """
     device = image.device.type
     if torch.is_autocast_enabled(device):  # which would compute in half precision
@@ -211,7 +212,10 @@ def repair(
             return nearness, doubt
     else:
         repaired, doubt = registered(
-            lambda edited, _: _repair(light, edited, step, auto, of_coc, ops, halvings), given, of_coc, ops
+            lambda edited, eroded, _: _repair(light, edited, step, auto, of_coc, ops, halvings, eroded),
+            given,
+            of_coc,
+            ops,
         )
     if nearness.dtype == torch.float32:
         return repaired, doubt
@@ -223,9 +227,9 @@ def _repair_item(
 ) -> tuple[Tensor, float]:
     """:func:`repair` by the compiled engine, for one item: ``[C, H, W]``, ``[H, W]``, and ``[H, W]`` or ``[]``."""
 
-    def once(given: Tensor, following: Tensor | None) -> Repaired:
+    def once(given: Tensor, eroded: Tensor, following: Tensor | None) -> Repaired:
         stops = 0 if following is None else sum(1 << k for k, edit in enumerate(following.flatten()) if edit)
-        repair = functools.partial(native.repair_edges, light, stops=stops)
+        repair = functools.partial(native.repair_edges, light, stops=stops, eroded=bool(eroded))
         flat = given[0, 0]
         repaired, doubt, is_wide, edits = repair(flat, step, auto, of_coc, stops_if_wide=halvings > 0)
         if is_wide:
@@ -370,8 +374,9 @@ def _repair(
     of_coc: bool = False,
     ops: Ops = EAGER,
     halvings: int = _HALVINGS,
+    eroded: Tensor | None = None,
 ) -> Repaired:
-    """One repair of a map as it is.
+    """One repair of a map as it is, or with eroded foregrounds.
 
     1. Find ramps and steps, and the nearness of both surfaces there; narrow the ramps of a map where they are too wide.
     2. From a sample of the edge pixels, detect soft maps, score the pixels by colour, and fit the prior of each kind of
@@ -389,7 +394,7 @@ def _repair(
         signed = -nearness if of_coc else nearness
         scene = _Map.of(image, signed, step, of_coc)
         sample = _Sample.of(scene)
-    errors = _errors_of(scene, sample, auto, is_related, ops)
+    errors = _errors_of(scene, sample, auto, is_related, eroded, ops)
     chosen = pixels.indices(errors.doubtful)
     if auto and is_empty(chosen):  # nor lamps: a soft map has ramps, which are selected
         return nearness, torch.zeros_like(errors.doubt), errors.edits
@@ -408,7 +413,9 @@ def _repair(
     return -repaired if of_coc else repaired, errors.doubt - errors.dilated, errors.edits
 
 
-def _errors_of(scene: _Map, sample: _Sample, auto: bool, is_related: Tensor, ops: Ops) -> _Errors:
+def _errors_of(
+    scene: _Map, sample: _Sample, auto: bool, is_related: Tensor, eroded: Tensor | None, ops: Ops
+) -> _Errors:
     """Step 2 of :func:`_repair`; ``is_related``: items whose colours are known to be related to the map."""
     edges, dtype, (sampled, level, is_ramp, ring, steps, softness) = scene.edges, scene.nearness.dtype, sample
     is_soft = softness > 1.0
@@ -435,18 +442,22 @@ def _errors_of(scene: _Map, sample: _Sample, auto: bool, is_related: Tensor, ops
     doubts, clear, agreed = directions.sum(2, keepdim=True).split([1, 2, 2])
     assumed = 0.5 * PRIOR_COUNT  # pixels, half of which agree
     is_related = is_related | (agreed + 0.5 * assumed > _RELATED * (clear + assumed)).any(0)
+    asked, dilated = edits_of(directions[1:3], directions[3:], shares, is_soft)
+    if eroded is not None:
+        dilated = torch.where(eroded, 1.0, dilated)
+    if not active().dilated:
+        dilated = none
     if active().registration:
-        edits = edits_of(directions[1:3], directions[3:], shares, is_soft).to(dtype)
+        edits = asked.to(dtype)
         is_related = is_related | (edits > 0).any(1, keepdim=True)
     is_soft = is_soft & is_related
     is_inexact = is_related & (is_soft | (doubts[0] > _EXACT * steps))
     doubtful = edges.is_edge & is_inexact & torch.where(edges.is_ramp, is_soft, wrong > _DOUBTFUL)
-    in_doubt, dilated = (torch.where(is_soft, found, 0.0) for found in doubt_of(clear, agreed))
+    in_doubt, dilated = (torch.where(is_soft, t, 0.0) for t in ((1.0 - dilated) * doubt_of(clear, agreed), dilated))
     # ramps of a pixel are means over pixels, or artefacts of compression: there is little to doubt
     faded = in_doubt * (softness - 1.0).clamp(0.0, 1.0)
     doubt = faded.to(dtype) if active().in_doubt else none
-    dilated = dilated.to(dtype) if active().dilated else none
-    return _Errors(is_soft, sharpness, prior, doubtful, doubt, dilated, edits)
+    return _Errors(is_soft, sharpness, prior, doubtful, doubt, dilated.to(dtype), edits)
 
 
 def _decided(scene: _Map, errors: _Errors, score: Tensor, chosen: Tensor, auto: bool) -> Tensor:
@@ -513,5 +524,7 @@ def _empty(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bo
 # The number of pixels to process depends on the data, which compiled graphs do not support.
 @one_operator("torchdof::repair_edges", _empty)
 def _operator(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool) -> tuple[Tensor, Tensor]:
-    repaired, doubt = registered(lambda edited, _: _repair(image, edited, step, auto, of_coc), nearness, of_coc)
+    repaired, doubt = registered(
+        lambda edited, eroded, _: _repair(image, edited, step, auto, of_coc, eroded=eroded), nearness, of_coc
+    )
     return repaired.clone(), doubt

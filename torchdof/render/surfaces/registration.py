@@ -16,32 +16,37 @@ from torch import Tensor
 
 from ...tensors import is_traced
 from ..engines.ops import EAGER, Ops
-from .doubt import OF_OTHER, contradicted
+from .doubt import contradicted
 from .edge_search import DIRECTIONS, PLACES, RINGS
 from .windows import LARGEST, NEVER, highest
 
 __all__ = ["EDITS", "Repaired", "edits_of", "registered"]
 
 _RESIZED = 0.4  # excess of the near surface at all edges from which foregrounds are resized
+_THIN, _WIDE = 0.15, 0.2  # the same at clear pixels from which they are dilated, or eroded
+_BESIDE = 0.2  # share of pixels beside the steps of a hard map that are wrong in each direction if it is too thin
 _SHIFTED = 0.12  # half the difference of the excess on two opposite sides from which a map is shifted
 _ONE_SIDE = 0.03  # least excess on each of the two, with opposite signs
-_THIN = 0.4  # share of clear pixels of the far side that contradict a map, from which its foregrounds are too thin
-_BESIDE = 0.2  # the same share beside the steps of a hard map, in each direction
-_WIDE, _WIDE_FAR = 0.3, 0.06  # those of near and far side above which they are too wide for the repair
+_DILATED = 0.3  # excess, negative, from which a soft map's foregrounds are too wide, and fully from `_RESIZED`
 _MOST_PX = 6  # px; by which foregrounds are resized, or a map is shifted, at most
 _SIDES = (0, 1, 3, 4)  # directions towards the near surface: at the edge below it, to its right, to its left, above it
 
 EDITS = 6
 """Number of edits: dilated foregrounds, eroded ones, maps shifted down, right, left, and up."""
 
+_ERODES = 1  # index of the edit of foregrounds that are too wide
 _ANY = 2.0  # stands for each edit before the first repair. Later 1: is done now, 0: is not, -1: never again
 
 Repaired = tuple[Tensor, Tensor, Tensor]
-"""A repaired map ``[B, 1, H, W]``, its doubt, and the result of :func:`edits_of` for the map before this repair."""
+"""A repaired map ``[B, 1, H, W]``, its doubt, and the edits of :func:`edits_of` for the map before this repair."""
+
+Once = Callable[[Tensor, Tensor, Tensor | None], Repaired]
+"""Repairs a map, of which foregrounds are eroded, a bool ``[B, 1, 1, 1]``. The last argument has the edits that may
+follow, ``[B, EDITS, 1, 1]``, or is None. If colours ask for one of them, only the third result counts."""
 
 
-def edits_of(clear: Tensor, agreed: Tensor, prior: Tensor, is_soft: Tensor) -> Tensor:
-    """Which edits colours ask for, 1 or 0: ``[B, EDITS, 1, 1]``.
+def edits_of(clear: Tensor, agreed: Tensor, prior: Tensor, is_soft: Tensor) -> tuple[Tensor, Tensor]:
+    """Which edits colours ask for, 1 or 0, and how far foregrounds of a soft map are dilated, too wide, 0 to 1.
 
     The excess of the near surface at edges of one direction is the share of far pixels that show the near surface, less
     that of near pixels that show the far one: -1 to 1, positive where these edges must move outward. On ramps, twice
@@ -52,33 +57,33 @@ def edits_of(clear: Tensor, agreed: Tensor, prior: Tensor, is_soft: Tensor) -> T
         agreed: The same.
         prior: Shares of pixels that show the near surface, of each kind, of :func:`.edge_prior.calibrate`.
         is_soft: Whether the map is soft, ``[B, 1, 1, 1]``: ramps then count, else steps.
+
+    Returns:
+        ``[B, EDITS, 1, 1]`` and ``[B, 1, 1, 1]``.
     """
     share = prior.view(-1, PLACES, DIRECTIONS)[..., None, None]
     beside_steps, on_ramps = share[:, 0] + share[:, RINGS] - 1.0, 2.0 * share[:, 2 * RINGS :].mean(1) - 1.0
     excess = torch.where(is_soft, on_ramps, beside_steps)
 
     near, far = contradicted(clear.sum(2, keepdim=True), agreed.sum(2, keepdim=True))
-    is_thin = (far > _THIN) & (far > OF_OTHER * near)
-    is_thin = is_thin & (is_soft | (share[:, 0].amin(1, keepdim=True) > _BESIDE))  # not hair alone
-    is_thin = is_thin | (excess.amin(1, keepdim=True) > _RESIZED)
-    # beyond the window of the repair some far pixels contradict a map too, because near colours are not found
-    is_wide = (near > _WIDE) & (near > OF_OTHER * far) & (far > _WIDE_FAR)
-    is_wide = is_wide | (~is_soft & (excess.amax(1, keepdim=True) < -_RESIZED))  # bright things have too wide ramps
+    least, most = excess.amin(1, keepdim=True), excess.amax(1, keepdim=True)
+    is_thin = (far - near > _THIN) & (is_soft | (share[:, 0].amin(1, keepdim=True) > _BESIDE))  # not hair alone
+    is_thin = is_thin | (least > _RESIZED)
+    is_wide = (near - far > _WIDE) & (most < _RESIZED)
+    is_wide = is_wide | (~is_soft & (most < -_RESIZED))  # bright things have too wide ramps
     near_apart, far_apart = contradicted(clear, agreed)
     both = torch.stack([excess, (far_apart - near_apart).to(excess.dtype)])
     outward, inward = (t[:, :, list(_SIDES)] for t in (both, -both.flip(2)))  # of opposite sides
     is_shifted = (torch.minimum(outward, inward) > _ONE_SIDE) & (0.5 * (outward + inward) > _SHIFTED)
-    return torch.cat([is_thin, is_wide, is_shifted.any(0)], 1).to(near.dtype)
+    dilated = torch.where(is_soft, ((-most - _DILATED) / (_RESIZED - _DILATED)).clamp(0.0, 1.0), 0.0)
+    return torch.cat([is_thin, is_wide, is_shifted.any(0)], 1).to(near.dtype), dilated
 
 
-def registered(
-    once: Callable[[Tensor, Tensor | None], Repaired], nearness: Tensor, of_coc: bool, ops: Ops = EAGER
-) -> tuple[Tensor, Tensor]:
+def registered(once: Once, nearness: Tensor, of_coc: bool, ops: Ops = EAGER) -> tuple[Tensor, Tensor]:
     """Repairs a map after the edits that colours ask for.
 
     Args:
-        once: Repairs a map. Its second argument has the edits that may follow, ``[B, EDITS, 1, 1]``, or is None. If
-            colours ask for one of them, only the third result counts.
+        once: Repairs a map.
         nearness: The map, ``[B, 1, H, W]``.
         of_coc: Whether it is a map of the coc instead, in which a larger value is farther.
         ops: Repeats the repair.
@@ -95,7 +100,7 @@ def registered(
             if is_traced() or is_done.any():
                 edited = torch.where(is_done, edit(edited), edited)
         may_follow = _following(edits)
-        again, its_doubt, asked = once(edited, may_follow if may_edit else None)
+        again, its_doubt, asked = once(edited, edits[:, _ERODES : _ERODES + 1] == 1, may_follow if may_edit else None)
         repaired, doubt = torch.where(is_new, again, repaired), torch.where(is_new, its_doubt, doubt)
         edits = torch.where(may_follow, asked, -1.0)
         return (edited, repaired, doubt, edits), (edits > 0).any()
@@ -104,7 +109,7 @@ def registered(
     if is_traced():
         state, times = (nearness, nearness, edits[:, :1], edits), _MOST_PX + 1
     else:
-        state, times = (nearness, *once(nearness, edits > 0)), _MOST_PX
+        state, times = (nearness, *once(nearness, edits[:, :1] < 0, edits > 0)), _MOST_PX
         if not state[-1].any():
             return state[1:3]
     _, repaired, doubt, _ = ops.repeated(step, state, times)
@@ -119,15 +124,22 @@ def _following(edits: Tensor) -> Tensor:
 
 def _edits(of_coc: bool) -> list[Callable[[Tensor], Tensor]]:
     """Functions of a map ``[B, 1, H, W]``, in the order of :data:`EDITS`."""
-    sizes = (functools.partial(_resized, sign=-by if of_coc else by) for by in (1.0, -1.0))
+    sign = -1.0 if of_coc else 1.0
+    sizes = (lambda values: sign * _dilated(sign * values), lambda values: sign * _eroded(sign * values))
     places = (functools.partial(_shifted, right=x, down=y) for x, y in ((0, 1), (1, 0), (-1, 0), (0, -1)))
     return [*sizes, *places]
 
 
-def _resized(nearness: Tensor, sign: float) -> Tensor:
-    """A map whose larger values, for sign -1 smaller ones, win a pixel on each side. Invalid values stay."""
+def _dilated(nearness: Tensor) -> Tensor:
+    """A map whose larger values win a pixel on each side. Invalid values stay."""
     valid = nearness.abs() <= LARGEST
-    return torch.where(valid, sign * highest(torch.where(valid, sign * nearness, -NEVER), 1), nearness)
+    return torch.where(valid, highest(torch.where(valid, nearness, -NEVER), 1), nearness)
+
+
+def _eroded(nearness: Tensor) -> Tensor:
+    """A map whose larger values lose a pixel on each side, except things up to 2 px wide, which would be lost."""
+    eroded = -_dilated(-nearness)
+    return torch.where(nearness.abs() <= LARGEST, eroded + (nearness - _dilated(eroded)), nearness)
 
 
 def _shifted(nearness: Tensor, right: int, down: int) -> Tensor:
