@@ -1,5 +1,6 @@
 """Exported files repair depth edges and render the pictures of the PyTorch engine."""
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -8,6 +9,7 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch
+import torch.nn.functional as functional
 from torch import Tensor
 
 from tests.scenes import furry_post, resized_post, shifted_disc, wavy_post
@@ -113,6 +115,29 @@ def test_a_file_resizes_foregrounds_and_shifts_maps(
         assert (float((expected - rendered(image, coc, "auto")).abs().max()) > 0.05) == (edit != (0, []))
     got = runner.run(None, {"image": image.numpy(), "coc_px": coc.numpy()})[0]
     assert error(got, expected, image) <= TOLERANCE
+
+
+@pytest.mark.parametrize(("factor", "halvings"), [(3, 0), (8, 1), (16, 2), (24, 2)])
+def test_a_file_narrows_the_ramps_of_enlarged_maps(
+    factor: int, halvings: int, runner: onnxruntime.InferenceSession, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At a half or a quarter of the size; beside it another item that needs none, and an invalid value."""
+    monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
+    image, _, exact = resized_post(0.1, 0, [])
+    exact = torch.where(exact < 0.0, -2.0, 2.0)
+    small = functional.avg_pool2d(exact, factor, ceil_mode=True)
+    coc = functional.interpolate(small, scale_factor=float(factor), mode="bilinear")[..., : exact.shape[-2], :160]
+    coc[..., 20, 30] = torch.nan
+    image, coc = image[:, :1].repeat(2, 1, 1, 1), torch.cat([coc, exact])
+    expected = rendered(image, coc, "auto")
+    for fewer in range(halvings):
+        repair = functools.partial(edges.repair, halvings=fewer)
+        with monkeypatch.context() as patch:
+            patch.setattr(edges, "repair", repair)
+            assert float((expected - rendered(image, coc, "auto")).nan_to_num().abs().max()) > 0.05
+    got = runner.run(None, {"image": image.numpy(), "coc_px": coc.numpy()})[0]
+    assert torch.from_numpy(np.array(got)).isnan().equal(expected.isnan())
+    assert error(np.nan_to_num(got), expected.nan_to_num(), image) <= TOLERANCE
 
 
 @pytest.mark.parametrize(("scene", "rule"), [(furry_post, "missed_parts"), (wavy_post, "in_doubt")])

@@ -233,8 +233,9 @@ def _repair_item(
         flat = given[0, 0]
         repaired, doubt, is_wide, edits = repair(flat, step, auto, of_coc, stops_if_wide=halvings > 0)
         if is_wide:
-            narrow, is_related = _narrowed(light[None], given, step[None, None], auto, of_coc, halvings)
-            repaired, doubt, _, edits = repair(narrow[0, 0], step, auto, of_coc, is_related=bool(is_related))
+            narrow = _narrowed(light[None], given, step[None, None], auto, of_coc, halvings)
+            is_related = bool(_differs(narrow, given))
+            repaired, doubt, _, edits = repair(narrow[0, 0], step, auto, of_coc, is_related=is_related)
         bits = [edits >> k & 1 for k in range(EDITS)]
         its_doubt, asked = (given.new_tensor(found).view(1, -1, 1, 1) for found in ([doubt], bits))
         return given if repaired is flat else repaired[None, None], its_doubt, asked
@@ -245,11 +246,11 @@ def _repair_item(
 
 
 def _narrowed(
-    light: Tensor, given: Tensor, step: Tensor, auto: bool, of_coc: bool, halvings: int
-) -> tuple[Tensor, Tensor]:
+    light: Tensor, given: Tensor, step: Tensor, auto: bool, of_coc: bool, halvings: int, ops: Ops = EAGER
+) -> Tensor:
     """A map ``[B, 1, H, W]`` plus what the repair changes at half the size: narrower ramps. Invalid values stay.
 
-    Also whether it changes something, ``[B, 1, 1, 1]``: then the colours are related to the map.
+    If this changes something, the colours are related to the map.
     """
     height, width = given.shape[-2:]
 
@@ -264,10 +265,14 @@ def _narrowed(
     sign = -1.0 if of_coc else 1.0
     if of_coc:  # in pixels of the smaller frame; undecided pixels wait for the full size to go to the more blurred side
         step = 2.0 * step
-    repaired, _ = repair(halved(finite_light(light)), sign * half, step, auto, halvings=halvings - 1)
+    repaired, _ = repair(halved(finite_light(light)), sign * half, step, auto, ops=ops, halvings=halvings - 1)
     change = torch.where(share > 0, repaired - sign * half, 0.0)
-    narrow = given + sign * upsampled(change, 2)[..., :height, :width]
-    return narrow, (change != 0).flatten(1).any(1)[:, None, None, None]
+    return given + sign * upsampled(change, 2)[..., :height, :width]
+
+
+def _differs(one: Tensor, other: Tensor) -> Tensor:
+    """Whether valid values of two maps differ, ``[B, 1, 1, 1]``."""
+    return ((one - other).abs() > 0).flatten(1).any(1)[:, None, None, None]
 
 
 @torch.no_grad()
@@ -388,9 +393,11 @@ def _repair(
     scene = _Map.of(image, signed, step, of_coc)
     sample = _Sample.of(scene)
     is_wide, is_related = sample.softness > _WIDE, torch.zeros_like(sample.softness, dtype=torch.bool)
-    if halvings and not is_traced() and is_wide.any():  # in graphs this would double the time of their export
-        narrow, is_changed = _narrowed(image, nearness, step, auto, of_coc, halvings)
-        nearness, is_related = torch.where(is_wide, narrow, nearness), is_wide & is_changed
+    if halvings and (is_traced() or is_wide.any()):
+        narrow = torch.where(is_wide, _narrowed(image, nearness, step, auto, of_coc, halvings, ops), nearness)
+        narrow = ops.equal_unless(is_wide.any, narrow, nearness)
+        is_related = is_wide & _differs(narrow, nearness)
+        nearness = narrow
         signed = -nearness if of_coc else nearness
         scene = _Map.of(image, signed, step, of_coc)
         sample = _Sample.of(scene)
