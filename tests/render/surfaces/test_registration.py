@@ -151,8 +151,8 @@ def found(contradicted: Tensor, prior: Tensor, is_soft: bool) -> list[int]:
     [
         (few_and_many(0.1, 0.3, RIGHT), few_and_many(0.1, 0.3, LEFT), [TO_RIGHT]),
         (few_and_many(0.1, 0.3, LEFT, UP), few_and_many(0.1, 0.3, RIGHT, DOWN), [TO_LEFT, TO_UP]),
-        (few_and_many(0.1, 0.3, DOWN), few_and_many(0.1, 0.15, UP), [TO_DOWN]),
-        (few_and_many(0.1, 0.3, DOWN), few_and_many(0.1, 0.12, UP), []),
+        (few_and_many(0.1, 0.3, DOWN), few_and_many(0.1, 0.18, UP), [TO_DOWN]),
+        (few_and_many(0.1, 0.3, DOWN), few_and_many(0.1, 0.15, UP), []),
         (few_and_many(0.1, 0.3, LEFT), few_and_many(0.1, 0.3, LEFT), []),
         (few_and_many(0.1, 0.2, LEFT), few_and_many(0.1, 0.2, RIGHT), []),
     ],
