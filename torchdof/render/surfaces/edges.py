@@ -434,9 +434,8 @@ def _errors_of(
     shares = calibrate(scene.light, kinds_sampled, score)
     prior = shares[kind]
     none = scene.nearness.new_zeros(scene.nearness.shape[0], 1, 1, 1)
-    edits = none.expand(-1, EDITS, -1, -1)
     if not auto:
-        return _Errors(is_soft, sharpness, prior, edges.is_edge, none, none, edits)
+        return _Errors(is_soft, sharpness, prior, edges.is_edge, none, none, none.expand(-1, EDITS, -1, -1))
 
     # colour agrees with the map at clear pixels: in the outermost ring of a step, or near a ramp's ends; on one side of
     # the edges only where the map's foreground is too thin, and at half of them where it has no relation
@@ -449,14 +448,14 @@ def _errors_of(
     doubts, clear, agreed = directions.sum(2, keepdim=True).split([1, 2, 2])
     assumed = 0.5 * PRIOR_COUNT  # pixels, half of which agree
     is_related = is_related | (agreed + 0.5 * assumed > _RELATED * (clear + assumed)).any(0)
-    asked, dilated = edits_of(directions[1:3], directions[3:], shares, is_soft)
+    edits, dilated = edits_of(directions[1:3], directions[3:], shares, is_soft)
     if eroded is not None:
         dilated = torch.where(eroded, 1.0, dilated)
     if not active().dilated:
         dilated = none
-    if active().registration:
-        edits = asked.to(dtype)
-        is_related = is_related | (edits > 0).any(1, keepdim=True)
+    if not active().registration:
+        edits = torch.zeros_like(edits)
+    is_related = is_related | (edits > 0).any(1, keepdim=True)
     is_soft = is_soft & is_related
     is_inexact = is_related & (is_soft | (doubts[0] > _EXACT * steps))
     doubtful = edges.is_edge & is_inexact & torch.where(edges.is_ramp, is_soft, wrong > _DOUBTFUL)
@@ -464,7 +463,7 @@ def _errors_of(
     # ramps of a pixel are means over pixels, or artefacts of compression: there is little to doubt
     faded = in_doubt * (softness - 1.0).clamp(0.0, 1.0)
     doubt = faded.to(dtype) if active().in_doubt else none
-    return _Errors(is_soft, sharpness, prior, doubtful, doubt, dilated.to(dtype), edits)
+    return _Errors(is_soft, sharpness, prior, doubtful, doubt, dilated.to(dtype), edits.to(dtype))
 
 
 def _decided(scene: _Map, errors: _Errors, score: Tensor, chosen: Tensor, auto: bool) -> Tensor:
