@@ -289,11 +289,10 @@ void check_edges(unsigned seed) {
       const std::vector<float> repaired = out;
       torchdof_map of_repaired = map;
       of_repaired.nearness = repaired.data();
-      std::vector<float> grown(2 * pixels);
+      std::vector<float> grown(pixels);
       of_repaired.out = grown.data();
       if (torchdof_missed_parts(&of_repaired, &doubt) != TORCHDOF_OK) fail("it cannot grow", int(seed));
-      if (torchdof_blurred_in_doubt(nearness.data(), grown.data(), &grown[pixels], map.height, map.width, 0.7f, threads,
-                                    out.data()))
+      if (torchdof_blurred_in_doubt(nearness.data(), grown.data(), map.height, map.width, 0.7f, threads, out.data()))
         fail("its edges cannot be blurred", int(seed));
     }
     for (size_t i = 0; i < pixels; i++) {

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from torchdof.render.layers import composite, layer_weights
-from torchdof.render.surfaces import disocclusion, doubt, frame, matting
+from torchdof.render.surfaces import disocclusion, frame, matting
 
 ROOT = Path(__file__).parents[2]
 COMPILER = os.environ.get("CXX") or shutil.which("c++")
@@ -25,7 +25,6 @@ RULES: dict[str, Callable[[Tensor], Tensor]] = {
     "on_near(v)[0]": matting.on_near,
     "on_far(v)[0]": matting._on_far,
     "clamp01(unlimited_sided(v))[0]": lambda x: (matting.PLACE_SLOPE * (x - matting._SIDED_FROM)).clamp(0.0, 1.0),
-    "hiding_px(x)": doubt.hiding_px,
     "own_end(x)": disocclusion.own_end,
     "is_another_surface(x)": disocclusion.is_another_surface,
     "is_another_surface(v)[0]": disocclusion.is_another_surface,

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 _CONSTANTS = (
-    *("composite", "disocclusion", "doubt", "edge_colours", "edge_prior", "edge_search"),
+    *("composite", "disocclusion", "edge_colours", "edge_prior", "edge_search"),
     *("frame", "layer_weights", "matting", "windows"),
 )
 HEADERS = (

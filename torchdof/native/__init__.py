@@ -431,18 +431,18 @@ def repair_edges(
 def missed_parts(light: Tensor, coc_px: Tensor) -> tuple[Tensor, float]:
     """Completes a map of the coc, as :func:`torchdof.render.surfaces.missed.completed`, for one image.
 
-    ``light`` is ``[C, H, W]``, ``coc_px`` ``[H, W]``. The results are the map and how unlike the background each pixel
-    is, ``[2, H, W]``, and how far the map has missed parts, 0 to 1.
+    ``light`` is ``[C, H, W]``, ``coc_px`` ``[H, W]``. The results are the map ``[H, W]`` and how far it has missed
+    parts, 0 to 1.
     """
-    out, share = _empty(2, *coc_px.shape), ctypes.c_double(0.0)
+    out, share = _empty(*coc_px.shape), ctypes.c_double(0.0)
     _of_map("missed_parts", light, coc_px, (True, None, 0.0, *(False,) * 5), out, share)
     return out, share.value
 
 
-def blurred_in_doubt(given: Tensor, repaired: Tensor, unlike: Tensor, doubt: float) -> Tensor:
+def blurred_in_doubt(given: Tensor, repaired: Tensor, doubt: float) -> Tensor:
     """Blurs the edges of a map of the coc ``[H, W]``, as :func:`torchdof.render.surfaces.doubt.blurred_in_doubt`."""
     out = _empty(*repaired.shape)
-    _run("blurred_in_doubt", given, repaired, unlike, *repaired.shape, doubt, _threads(), out)
+    _run("blurred_in_doubt", given, repaired, *repaired.shape, doubt, _threads(), out)
     return out
 
 

@@ -133,15 +133,13 @@ typedef struct {
 // a bit each, in the order of render/surfaces/registration.py.
 TORCHDOF_API int32_t torchdof_repair_edges(const torchdof_map *map, int32_t *changed, double *doubt, int32_t *edits);
 
-// Gives missed fine parts of blurred foregrounds to them, in a map of coc; reads no members from steps to eroded. out
-// is [2, height, width]: the map, and how unlike the background each pixel is, 0 to 1; 1 where none is known. share:
-// how far the map has missed parts, 0 to 1.
+// Gives missed fine parts of blurred foregrounds to them, in a map of coc; reads no members from steps to eroded.
+// share: how far the map has missed parts, 0 to 1.
 TORCHDOF_API int32_t torchdof_missed_parts(const torchdof_map *map, double *share);
 
-// Blurs the edges of a map of coc [height, width] that is in doubt, from the map before its repair and after it, and
-// how unlike the background each pixel is.
-TORCHDOF_API int32_t torchdof_blurred_in_doubt(const float *given, const float *repaired, const float *unlike,
-                                               int32_t height, int32_t width, float doubt, int32_t threads, float *out);
+// Blurs the edges of a map of coc [height, width] that is in doubt, from the map before its repair and after it.
+TORCHDOF_API int32_t torchdof_blurred_in_doubt(const float *given, const float *repaired, int32_t height, int32_t width,
+                                               float doubt, int32_t threads, float *out);
 
 // A padded frame whose layers are blurred and composited: surfaces of each pixel, all of them with a margin.
 typedef struct {

@@ -114,10 +114,9 @@ def test_engines_agree(size: tuple[int, int]) -> None:
         given += 0.2 * torch.randn(given.shape, generator=generator)
         bad = torch.rand(given.shape, generator=generator) < 0.01 * seed
         given[bad], image[:, :, bad[0, 0].flip(0)] = math.nan, math.inf
-        plain, unlike, share = missed._completed(image, given, torch.tensor([True]), missed.EAGER)
-        (fast, of_fast), fast_share = native.missed_parts(image[0], given[0, 0])
+        plain, share = missed._completed(image, given, torch.tensor([True]), missed.EAGER)
+        fast, fast_share = native.missed_parts(image[0], given[0, 0])
         torch.testing.assert_close(fast, plain[0, 0], rtol=0, atol=0, equal_nan=True)
-        torch.testing.assert_close(of_fast, unlike[0, 0], rtol=0, atol=1e-3)
         assert fast_share == pytest.approx(float(share), abs=1e-4)
 
 
@@ -128,7 +127,7 @@ def test_any_number_of_threads_gives_the_same_bits() -> None:
     for count in (1, 2, 5, threads):
         torch.set_num_threads(count)
         results.append(native.missed_parts(image[0], given[0, 0])[0])
-    assert not results[0][0].equal(given[0, 0])
+    assert not results[0].equal(given[0, 0])
     assert all(result.equal(results[0]) for result in results)
 
 

@@ -59,7 +59,6 @@ class Missed : Frame {
   // Returns how far the map has missed parts, 0 to 1.
   double run() {
     memcpy(map_.out, map_.nearness, area_ * sizeof(float));
-    std::fill_n(map_.out + area_, area_, 1.0f);
     find_rings();
     if (tiles_.empty()) return 0;
     const std::vector<float> means = described(background(described(background({}))));
@@ -154,7 +153,7 @@ class Missed : Frame {
         for (int at = i * PITCH + LANES; at < (i + 1) * PITCH - LANES; at += LANES) {
           const vec was = load<vec>(near + at);
           const vec least = least_of(lowest + at, PITCH, reach);
-          const ivec is_new = (was == FAR_PX) & (-least > hiding_px(abs(load<vec>(coc + at))));
+          const ivec is_new = (was == FAR_PX) & (-least > (abs(load<vec>(coc + at)) + APART_PX) * (1.0f / SHARPER));
           if (!any_of(is_new)) continue;
           is_any_new = true;
           store(near + at, is_new ? least : was);
@@ -367,8 +366,7 @@ class Missed : Frame {
     return clamp01((share - MISSED) / (MANY_MISSED - MISSED));
   }
 
-  // Step 5: gives the near surface to pixels of rings whose middle is within its growth. Stores how unlike the
-  // background pixels are.
+  // Step 5: gives the near surface to pixels of rings whose middle is within its growth.
   void grow(const std::vector<float> &means, float everywhere) {
     each_tile([&](int tile) {
       Background of(channels_);
@@ -382,12 +380,9 @@ class Missed : Frame {
         const vec smooth = load<vec>(of.is_smooth() + j) * GROWTH_OVER_SMOOTH_PX;
         const vec middle = lookup(MIDDLES_PX, convert(load<vec>(&ring_[at])));
         const ivec is_taken = is_known & (max(smooth, broadcast(everywhere)) > middle);
-        const vec is_unlike = unlike(at, of, j);
         float *const out = map_.out + pixel((int)(at / pitch_), (int)(at % pitch_));
-        for (int l = 0; l < LANES; l++) {
+        for (int l = 0; l < LANES; l++)
           if (is_taken[l]) out[l] = near_[at + l];
-          if (is_known[l]) out[area_ + l] = is_unlike[l];
-        }
       };
       each_vector(tile, 1, prepare, take, [](int) {});
     });

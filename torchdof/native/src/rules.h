@@ -5,7 +5,6 @@
 #pragma once
 #include "constants/composite.h"
 #include "constants/disocclusion.h"
-#include "constants/doubt.h"
 #include "constants/frame.h"
 #include "constants/layer_weights.h"
 #include "constants/matting.h"
@@ -16,7 +15,6 @@ namespace torchdof {
 // Constants of Python modules, which give their meanings, units and effects.
 using constants::composite::KNOWN;
 using constants::disocclusion::BEHIND_PX, constants::disocclusion::OF_MEAN, constants::disocclusion::OWN_SLOPE;
-using constants::doubt::APART_PX, constants::doubt::SHARPER;
 using constants::frame::AT_FOCUS, constants::frame::OFF_FOCUS, constants::frame::BARELY_BLURRED;
 using constants::frame::CONTINUES_FROM, constants::frame::COUNTED, constants::frame::HIDDEN_WEIGHT;
 using constants::frame::HIDING_SHARE, constants::frame::LEAST_PASSING, constants::frame::SEEN_FROM;
@@ -36,13 +34,6 @@ inline auto within(V v) {
 template <typename V>
 inline V apart_px(V near, V far) {
   return far - near - SAME_BLUR * min(absolute(near), absolute(far));
-}
-
-// Blur from which a near surface is clearly more blurred than, and thus in front of, a pixel with this blur.
-// render/surfaces/doubt.py, hiding_px.
-template <typename V>
-inline V hiding_px(V blur) {
-  return (blur + APART_PX) * (1.0f / SHARPER);
 }
 
 // A pixel between two surfaces, at n from 0 at the far one to 1 at the near one, counts to the near one by

@@ -149,8 +149,8 @@ def mended(image: Tensor, coc_px: Tensor, edges: DepthEdges, ops: Ops = EAGER, m
     if repaired is given:
         return coc_px
     may_grow = doubt > -_MISSES_NOTHING  # else the map's foregrounds are too wide and miss nothing
-    grown, unlike, missed = completed(image, repaired, torch.where(may_grow, given, repaired), ops)
-    blurred = blurred_in_doubt(given, grown, unlike, torch.maximum(doubt, missed), ops)
+    grown, missed = completed(image, repaired, torch.where(may_grow, given, repaired), ops)
+    blurred = blurred_in_doubt(given, grown, torch.maximum(doubt, missed), ops)
     if matte is None:
         repaired = blurred
     else:

@@ -23,7 +23,6 @@ from ..engines.compiled_steps import by_items
 from ..engines.ops import EAGER, Ops
 from ..engines.traced import is_compiled, one_operator
 from ..rules import active
-from .doubt import hiding_px
 from .edge_colours import finite_light
 from .windows import highest
 
@@ -48,11 +47,18 @@ _GROWTH_OVER_SMOOTH_PX = 10.0  # px; by which they grow over a smooth background
 _ON_SURFACE = 0.25  # deviation of the coc of samples, over the difference of both surfaces, up to which they are one
 _LEAST_SAMPLES = 0.006  # fraction of the window that samples fill
 _FAR_PX = 1e9  # px; a coc that marks pixels without a near surface
+_SHARPER = 0.7037  # largest blur of a pixel beyond an edge, over that of the near surface; no simple fraction
+_APART_PX = 2.0  # px; subtracted from it; larger: fewer edges
 _LARGEST_PX = 1e6  # px; largest valid coc, whose square is exact enough
 _BRIGHTEST = 1e15  # largest light that is compared
 
 
-def completed(image: Tensor, coc_px: Tensor, before: Tensor, ops: Ops = EAGER) -> tuple[Tensor, Tensor, Tensor]:
+def _hiding_px(blur_px: Tensor) -> Tensor:
+    """Blur from which a near surface is clearly more blurred than, and thus in front of, a pixel with this blur."""
+    return (blur_px + _APART_PX) * (1.0 / _SHARPER)
+
+
+def completed(image: Tensor, coc_px: Tensor, before: Tensor, ops: Ops = EAGER) -> tuple[Tensor, Tensor]:
     """Lets blurred foregrounds grow by what the map misses of them.
 
     Maps that the repair of edges has left as they are count as exact, and stay.
@@ -74,38 +80,34 @@ def completed(image: Tensor, coc_px: Tensor, before: Tensor, ops: Ops = EAGER) -
         ops: Skips frames without such edges.
 
     Returns:
-        The map; gradients flow to unchanged pixels. How unlike the background each pixel is, 0 to 1, as in step 3, and
-        1 where no background is known, ``[B, 1, H, W]``. And how far the map has missed parts, 0 (the share of step 4
-        is at most :data:`_MISSED`) to 1 (:data:`_MANY_MISSED`), ``[B, 1, 1, 1]``: some are still beyond its growth.
+        The map; gradients flow to unchanged pixels. And how far the map has missed parts, 0 (the share of step 4 is at
+        most :data:`_MISSED`) to 1 (:data:`_MANY_MISSED`), ``[B, 1, 1, 1]``: some are still beyond its growth.
     """
     light = image.detach().float()
     repaired, before = (t.detach().float().expand(image.shape[0], -1, -1, -1) for t in (coc_px, before))
     is_inexact = ((repaired - before).abs() > 0).flatten(1).any(1)
     share = light.new_zeros(image.shape[0], 1, 1, 1)
     if not active().missed_parts or (not is_traced() and not is_inexact.any()):
-        return coc_px, torch.ones_like(repaired), share
+        return coc_px, share
     if is_compiled():
-        near_px, unlike, share = _operator(light, repaired, is_inexact)
+        near_px, share = _operator(light, repaired, is_inexact)
     elif engine_reads(light, repaired):
-        maps, share = by_items(_completed_item, repaired, light, is_inexact)
-        near_px, unlike = maps[:, 0].split(1, 1)
+        near_px, share = by_items(_completed_item, repaired, light, is_inexact)
     else:
-        near_px, unlike, share = _completed(light, repaired, is_inexact, ops)
-    return torch.where(near_px == repaired, coc_px, near_px.to(coc_px.dtype)), unlike, share
+        near_px, share = _completed(light, repaired, is_inexact, ops)
+    return torch.where(near_px == repaired, coc_px, near_px.to(coc_px.dtype)), share
 
 
 def _completed_item(light: Tensor, coc_px: Tensor, is_inexact: Tensor) -> tuple[Tensor, float]:
-    """The map and how unlike the background its pixels are, ``[2, H, W]``, and the share, of one item."""
-    if is_inexact:
-        return native.missed_parts(light, coc_px)
-    return torch.stack([coc_px, torch.ones_like(coc_px)]), 0.0
+    """The map ``[H, W]`` and the share of one item."""
+    return native.missed_parts(light, coc_px) if is_inexact else (coc_px, 0.0)
 
 
 @torch.no_grad()
-def _completed(image: Tensor, coc_px: Tensor, is_inexact: Tensor, ops: Ops) -> tuple[Tensor, Tensor, Tensor]:
+def _completed(image: Tensor, coc_px: Tensor, is_inexact: Tensor, ops: Ops) -> tuple[Tensor, Tensor]:
     """:func:`completed` by PyTorch, for float32."""
     is_valid = (coc_px.abs() <= _LARGEST_PX) & is_inexact[:, None, None, None]
-    coc, hiding = torch.where(is_valid, coc_px, 0.0), torch.where(is_valid, hiding_px(coc_px.abs()), _FAR_PX)
+    coc, hiding = torch.where(is_valid, coc_px, 0.0), torch.where(is_valid, _hiding_px(coc_px.abs()), _FAR_PX)
     # blur of the near surface, of which each ring takes the largest around it; negative behind the focus
     values = torch.where(is_valid, -coc_px, -_FAR_PX)
     near, ring = torch.full_like(coc, -_FAR_PX), torch.zeros_like(coc)
@@ -116,7 +118,7 @@ def _completed(image: Tensor, coc_px: Tensor, is_inexact: Tensor, ops: Ops) -> t
         values = near
     has_edges = ring.any()
     if not is_traced() and not has_edges:
-        return coc_px, torch.ones_like(coc), coc.new_zeros(coc.shape[0], 1, 1, 1)
+        return coc_px, coc.new_zeros(coc.shape[0], 1, 1, 1)
 
     light = finite_light(image, _BRIGHTEST).sqrt()
     is_sampled = (torch.arange(coc.shape[-2], device=coc.device) % _SAMPLED == 0)[:, None]
@@ -138,7 +140,7 @@ def _completed(image: Tensor, coc_px: Tensor, is_inexact: Tensor, ops: Ops) -> t
     growth = _GROWTH_PX * share
     growth = torch.where(is_smooth > 0, growth.clamp_min(_GROWTH_OVER_SMOOTH_PX), growth)
     is_taken = known & (growth > _middles_px(coc.dtype, coc.device)[ring.long()])
-    return ops.equal_unless(lambda: has_edges, torch.where(is_taken, -near, coc_px), coc_px), unlike, share
+    return ops.equal_unless(lambda: has_edges, torch.where(is_taken, -near, coc_px), coc_px), share
 
 
 @kept
@@ -148,15 +150,15 @@ def _middles_px(dtype: torch.dtype, device: torch.device) -> Tensor:
     return torch.tensor([0.0, *middles], dtype=dtype, device=device)
 
 
-def _empty(image: Tensor, coc_px: Tensor, is_inexact: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    return coc_px.new_empty(coc_px.shape), coc_px.new_empty(coc_px.shape), coc_px.new_empty(coc_px.shape[0], 1, 1, 1)
+def _empty(image: Tensor, coc_px: Tensor, is_inexact: Tensor) -> tuple[Tensor, Tensor]:
+    return coc_px.new_empty(coc_px.shape), coc_px.new_empty(coc_px.shape[0], 1, 1, 1)
 
 
 # Compiled graphs do not support steps that depend on the data.
 @one_operator("torchdof::missed_parts", _empty)
-def _operator(image: Tensor, coc_px: Tensor, is_inexact: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    near_px, unlike, share = _completed(image, coc_px, is_inexact, EAGER)
-    return near_px.clone(memory_format=torch.contiguous_format), unlike, share
+def _operator(image: Tensor, coc_px: Tensor, is_inexact: Tensor) -> tuple[Tensor, Tensor]:
+    near_px, share = _completed(image, coc_px, is_inexact, EAGER)
+    return near_px.clone(memory_format=torch.contiguous_format), share
 
 
 def _compared(light: Tensor, coc: Tensor, weight: Tensor) -> tuple[Tensor, ...]:
