@@ -4,9 +4,8 @@ Estimated depth often has its edges some pixels beside those of the image, on ei
 leave sharp scraps beside blurred foregrounds, and rough rims on surfaces in focus. The share of the clearest pixels
 that have the colour of the surface across the edge measures this doubt. A map that misses parts of its foregrounds
 (:mod:`.missed`) is in doubt as well: they are found only within a few pixels, and hair is longer. In doubt, a blurred
-foreground blurs its surroundings a little, as far as its own blur covers them, less with every pixel of distance; and
-so is everything at an edge. Colours that contradict only the near side mean that foregrounds are too wide, as portrait
-modes draw them.
+foreground blurs its surroundings too, less with every pixel of distance, and everything at an edge is a little blurred.
+Colours that contradict only the near side mean that foregrounds are too wide, as portrait modes draw them.
 """
 
 import torch

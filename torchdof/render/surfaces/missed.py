@@ -129,7 +129,7 @@ def _completed(image: Tensor, coc_px: Tensor, is_inexact: Tensor, ops: Ops) -> t
     is_one = spread.sqrt() + (middle - on_surface).abs() < _ON_SURFACE * (on_surface + near)
     known = (ring > 0) & (seen > _LEAST_SAMPLES) & is_one
     odds = (deviation / _UNLIKE).clamp(max=_MOST_UNLIKE).square()
-    unlike = torch.where(known, odds / (1.0 + odds), 1.0)
+    unlike = odds / (1.0 + odds)
     compared = known & is_sampled
     parts = (compared & (ring > 1) & (ring <= _RIM), compared & (ring == len(_RINGS_PX)))
     sums = [torch.cat([part * unlike, part], 1).sum((2, 3), keepdim=True).split(1, 1) for part in parts]
