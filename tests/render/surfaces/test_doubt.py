@@ -29,7 +29,7 @@ def test_nothing_beside_a_blurred_foreground_is_sharp_where_the_image_contradict
     beside = torch.zeros_like(post)
     beside[:, 1:-1] = ~post[:, 1:-1] & (post[:, 2:] | post[:, :-2])
     assert int(beside.sum()) > 300
-    assert float(coc[beside].abs().min()) > 1.5
+    assert float(coc[beside].abs().min()) > 2.0
     assert float(coc[:, :30].abs().max()) < 1.0  # far from it
 
 
@@ -76,7 +76,7 @@ def test_a_map_that_misses_parts_is_in_doubt(engine: str) -> None:
     coc = mended(image, given)
     with without(["in_doubt"]):
         before = mended(image, given)
-    assert int((coc.abs() > before.abs() + 0.5).sum()) > 1000
+    assert int((coc.abs() > before.abs() + 1.0).sum()) > 1000
 
 
 def test_a_map_with_ramps_of_a_pixel_is_less_in_doubt(engine: str) -> None:
